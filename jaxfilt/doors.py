@@ -1,0 +1,152 @@
+"""Checks at the door: every complaint names the argument, what was expected and what came.
+
+Structure, shapes and dtypes are known while tracing, so they are checked everywhere, at no cost to the compiled
+program. Values are checked where they are there to see: outside `jit`. What goes wrong inside is reported in
+`Info.status`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxfilt.types import Gaussian, Model, PyTree, Sensor, Space
+
+ROUNDING = 1e3
+"""Times n * eps of its own size that a covariance may be off symmetry or below zero and still count as rounding."""
+
+
+def is_concrete(x: Any) -> bool:
+    """Whether the values of every leaf can be read now."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(x))
+
+
+def describe(x: PyTree) -> str:
+    """A pytree in a few words: its structure with a dtype and shape for every leaf."""
+
+    def leaf(a: Any) -> str:
+        if isinstance(a, (bool, int, float)):
+            return f"{type(a).__name__} {a}"
+        return f"{a.dtype}{list(a.shape)}" if hasattr(a, "dtype") else type(a).__name__
+
+    described = [leaf(a) for a in jax.tree.leaves(x)]
+    structure = jax.tree.structure(x)
+    if structure == jax.tree.structure(0):
+        return described[0]
+    words = iter(described)
+    return str(jax.tree.unflatten(structure, [_Word(next(words)) for _ in described]))
+
+
+class _Word(str):
+    __repr__ = str.__str__
+
+
+def point(name: str, x: PyTree, space: Space, leading: tuple[int, ...] = ()) -> None:
+    """Raise unless x is a point of the space: same structure, shapes and floating dtype."""
+    template = space.origin
+    if jax.tree.structure(x) != jax.tree.structure(template):
+        raise ValueError(f"{name}: expected a pytree like {describe(template)}, got {describe(x)}")
+    for want, got in zip(jax.tree.leaves(template), jax.tree.leaves(x), strict=True):
+        expected = leading + np.shape(want)
+        if np.shape(got) != expected:
+            raise ValueError(f"{name}: expected shapes {_shapes(template, leading)}, got {_shapes(x)}")
+        floating(name, got)
+
+
+def _shapes(x: PyTree, leading: tuple[int, ...] = ()) -> str:
+    return describe_shapes(jax.tree.map(lambda a: leading + np.shape(a), x), x)
+
+
+def describe_shapes(shapes: PyTree, like: PyTree) -> str:
+    """The shapes of a pytree's leaves, as a tree of tuples."""
+    structure = jax.tree.structure(like)
+    if structure == jax.tree.structure(0):
+        return str(shapes)
+    leaves = structure.flatten_up_to(shapes)
+    return str(structure.unflatten([_Word(s) for s in leaves]))
+
+
+def floating(name: str, x: Any) -> None:
+    """Raise unless x is of a floating dtype; a Python float will do, an int will not."""
+    dtype = getattr(x, "dtype", type(x))
+    if not (dtype is float or np.issubdtype(dtype, np.floating)):
+        raise TypeError(f"{name}: expected floating numbers, got {describe(x)}")
+
+
+def same_dtype(dtype: Any, **named: PyTree) -> None:
+    """Raise unless every array leaf has this dtype; Python floats take any."""
+    for name, tree in named.items():
+        for leaf in jax.tree.leaves(tree):
+            got = getattr(leaf, "dtype", None)
+            if got is not None and np.issubdtype(got, np.floating) and jax.dtypes.canonicalize_dtype(got) != dtype:
+                raise TypeError(f"{name}: expected {dtype} like the belief's cov, got {describe(leaf)}")
+
+
+def finite(name: str, x: PyTree) -> None:
+    """Raise where a visible value is NaN or inf."""
+    if not is_concrete(x):
+        return
+    for leaf in jax.tree.leaves(x):
+        bad = ~np.isfinite(np.asarray(leaf))
+        if bad.any():
+            where = np.argwhere(bad)[0].tolist()
+            value = np.asarray(leaf)[tuple(where)]
+            raise ValueError(f"{name}: expected finite numbers, got {value} at {where} ({bad.sum()} in all)")
+
+
+def covariance(name: str, P: Any, dim: int | None = None) -> None:
+    """Raise unless P is a (dim, dim) symmetric positive semidefinite matrix, to rounding relative to its own size."""
+    shape = np.shape(P)
+    if len(shape) != 2 or shape[0] != shape[1] or (dim is not None and shape[0] != dim):
+        expected = "square" if dim is None else (dim, dim)
+        raise ValueError(f"{name}: expected shape {expected}, got {shape}")
+    floating(name, P)
+    finite(name, P)
+    if not is_concrete(P):
+        return
+    P = np.asarray(P)
+    slack = ROUNDING * len(P) * float(np.finfo(P.dtype).eps)
+    size = np.sqrt(np.abs(np.diag(P)))
+    scale = np.where(size > 0, size, 1.0)
+    scaled = P / np.outer(scale, scale)
+    if (np.diag(P) < 0).any():
+        i = int(np.argmin(np.diag(P)))
+        raise ValueError(f"{name}: expected variances >= 0 on the diagonal, got {P[i, i]:.6g} at [{i}, {i}]")
+    skew = np.abs(scaled - scaled.T)
+    if skew.max() > slack:
+        i, j = divmod(int(np.argmax(skew)), len(P))
+        raise ValueError(
+            f"{name}: expected a symmetric matrix, got {P[i, j]:.6g} at {(i, j)}, {P[j, i]:.6g} at {(j, i)}"
+        )
+    lowest = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
+    if lowest < -slack:
+        raise ValueError(
+            f"{name}: expected a positive semidefinite matrix, got correlations with eigenvalue {lowest:.6g}"
+        )
+
+
+def belief(name: str, b: Any, space: Space) -> None:
+    """Raise unless b is a Gaussian on the space with a proper covariance."""
+    if not (isinstance(b, Gaussian) or (hasattr(b, "mean") and hasattr(b, "cov"))):
+        raise TypeError(f"{name}: expected a Gaussian(mean, cov), got {type(b).__name__}")
+    point(f"{name}.mean", b.mean, space)
+    finite(f"{name}.mean", b.mean)
+    covariance(f"{name}.cov", b.cov, space.dim)
+    same_dtype(jax.dtypes.canonicalize_dtype(b.cov.dtype), **{f"{name}.mean": b.mean})
+
+
+def noise(name: str, P: Any, dim: int, dtype: Any) -> None:
+    """Raise unless a model's Q or R came out as a (dim, dim) array of the belief's dtype; its values may be traced."""
+    if np.shape(P) != (dim, dim):
+        raise ValueError(f"{name}: expected shape {(dim, dim)}, got {np.shape(P)}")
+    floating(name, P)
+    same_dtype(dtype, **{name: P})
+
+
+def sensor(model: Model, name: str) -> Sensor:
+    """The model's sensor of this name."""
+    if name not in model.sensors:
+        raise KeyError(f"sensor: expected one of {list(model.sensors)}, got {name!r}")
+    return model.sensors[name]

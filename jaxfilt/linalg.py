@@ -1,0 +1,104 @@
+"""Every factorization and solve of the library; nobody else calls cholesky, solve, qr or eigh.
+
+LAPACK is called once per run of a batch, which under `vmap` costs more than the rest of a filter's step.
+The matrices of a robot are small, so their factors are written out element by element: straight-line code that
+batches, fuses and differentiates. Above `WRITTEN_OUT` rows a loop over columns takes over.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+WRITTEN_OUT = 12
+"""Largest matrix whose factor is written out; beyond it the time to compile outgrows what is saved."""
+
+
+def cholesky(A: jax.Array) -> jax.Array:
+    """Lower L with L L' = A for a positive definite A (n, n); NaN from the first pivot that is not positive."""
+    return _factor(A, semidefinite=False)
+
+
+def semidefinite_cholesky(A: jax.Array) -> jax.Array:
+    """Lower L with L L' = A for a positive *semi*definite A (n, n): a square root for singular covariances too.
+
+    A pivot that is zero to rounding, relative to its own diagonal element (n eps), gives a zero column; a
+    negative one gives NaN. Nothing absolute is added or compared, so the factor scales with A.
+    """
+    return _factor(A, semidefinite=True)
+
+
+def _factor(A: jax.Array, semidefinite: bool) -> jax.Array:
+    n = A.shape[0]
+    slack = n * float(jnp.finfo(A.dtype).eps) if semidefinite else None
+    return _written_out(A, slack) if n <= WRITTEN_OUT else _by_columns(A, slack)
+
+
+def _pivot(pivot: jax.Array, size: jax.Array, slack: float | None) -> tuple[jax.Array, jax.Array | bool]:
+    """The root of a pivot, and whether its column is zero (where the root is 1, to divide by)."""
+    if slack is None:
+        return jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan)), False
+    zero = jnp.abs(pivot) <= slack * size
+    return jnp.sqrt(jnp.where(zero, 1.0, pivot)), zero
+
+
+def _written_out(A: jax.Array, slack: float | None) -> jax.Array:
+    n = A.shape[0]
+    nought = jnp.zeros((), A.dtype)
+    L = [[nought] * n for _ in range(n)]
+    for j in range(n):
+        root, zero = _pivot(A[j, j] - sum((L[j][k] * L[j][k] for k in range(j)), nought), A[j, j], slack)
+        for i in range(j, n):
+            element = root if i == j else (A[i, j] - sum((L[i][k] * L[j][k] for k in range(j)), nought)) / root
+            L[i][j] = element if zero is False else jnp.where(zero, 0.0, element)
+    return jnp.stack([jnp.stack(row) for row in L])
+
+
+def _by_columns(A: jax.Array, slack: float | None) -> jax.Array:
+    n = A.shape[0]
+    size = jnp.diagonal(A)
+
+    def eliminate(rest: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+        root, zero = _pivot(rest[j, j], size[j], slack)
+        column = jnp.where(jnp.arange(n) < j, 0.0, rest[:, j] / root)
+        column = column if zero is False else jnp.where(zero, 0.0, column)
+        return rest - jnp.outer(column, column), column
+
+    return jax.lax.scan(eliminate, A, jnp.arange(n))[1].T
+
+
+def forward_solve(L: jax.Array, b: jax.Array) -> jax.Array:
+    """L^-1 b for a lower triangular L (n, n) and b (n,) or (n, k)."""
+    n = L.shape[0]
+    if n > WRITTEN_OUT:
+        return jax.scipy.linalg.solve_triangular(L, b, lower=True)
+    y: list[jax.Array] = []
+    for i in range(n):
+        y.append((b[i] - sum((L[i, k] * y[k] for k in range(i)), jnp.zeros_like(b[i]))) / L[i, i])
+    return jnp.stack(y)
+
+
+def backward_solve(L: jax.Array, b: jax.Array) -> jax.Array:
+    """L'^-1 b for a lower triangular L (n, n) and b (n,) or (n, k)."""
+    n = L.shape[0]
+    if n > WRITTEN_OUT:
+        return jax.scipy.linalg.solve_triangular(L, b, lower=True, trans=1)
+    y: list[jax.Array] = []
+    for i in reversed(range(n)):
+        y.insert(0, (b[i] - sum((L[k, i] * y[k - i - 1] for k in range(i + 1, n)), jnp.zeros_like(b[i]))) / L[i, i])
+    return jnp.stack(y)
+
+
+def gain(cross: jax.Array, L: jax.Array) -> jax.Array:
+    """C S^-1 for C (n, m) and S = L L'."""
+    return backward_solve(L, forward_solve(L, cross.T)).T
+
+
+def log_determinant(L: jax.Array) -> jax.Array:
+    """log |L L'| of a lower triangular L."""
+    return 2 * jnp.sum(jnp.log(jnp.diagonal(L)))
+
+
+def symmetrize(P: jax.Array) -> jax.Array:
+    """(P + P') / 2: a product A P A' is symmetric only to rounding."""
+    return 0.5 * (P + P.T)

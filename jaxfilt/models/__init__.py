@@ -1,0 +1,1 @@
+"""Models of robots and their sensors, one file a domain."""

@@ -1,0 +1,138 @@
+"""From parameters to covariances: what Q and R are made of.
+
+`const`, `white` and `van_loan` lift a matrix to the function that a `Model` or a `Sensor` wants. A `Parametrisation`
+maps unconstrained numbers to a covariance and back, for tuning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilt import doors, linalg
+from jaxfilt.types import Array, PyTree
+
+
+def const(cov: Array) -> Callable[..., Array]:
+    """The same covariance always: as R of a sensor, or as a Q that is one per step, whatever dt.
+
+    Raises:
+        ValueError: not a symmetric positive semidefinite matrix.
+    """
+    doors.covariance("const(cov)", cov)
+    return lambda *_: cov
+
+
+def white(density: Array) -> Callable[[PyTree, PyTree, Array], Array]:
+    """Q of white noise on the state's rate: ``Q(x, u, dt) = density dt``, first order in dt.
+
+    Args:
+        density: (n, n) power spectral density, the unit of the state squared per second.
+    """
+    doors.covariance("white(density)", density)
+    return lambda x, u, dt: density * dt
+
+
+def van_loan(A: Array, density: Array) -> Callable[[PyTree, PyTree, Array], Array]:
+    """Exact Q of ``dx = A x dt + white noise``: ``integral_0^dt exp(A s) density exp(A s)' ds``.
+
+    Args:
+        A: (n, n) continuous-time dynamics matrix, 1/s.
+        density: (n, n) power spectral density, the unit of the state squared per second.
+
+    Example: a position driven by white acceleration.
+        >>> import jax.numpy as jnp, jaxfilt as jf
+        >>> Q = jf.van_loan(jnp.array([[0.0, 1.0], [0.0, 0.0]]), jnp.diag(jnp.array([0.0, 3.0])))
+        >>> [[round(float(q), 4) for q in row] for row in Q(None, None, 1.0)]
+        [[1.0, 1.5], [1.5, 3.0]]
+
+    Source: C. F. Van Loan, Computing integrals involving the matrix exponential (1978), theorem 1.
+    """
+    n = A.shape[0]
+    doors.covariance("van_loan(density)", density, n)
+    block = jnp.block([[-A, density], [jnp.zeros_like(A), A.T]])
+
+    def Q(x: PyTree, u: PyTree, dt: Array) -> Array:
+        E = jax.scipy.linalg.expm(block * dt)
+        return linalg.symmetrize(E[n:, n:].T @ E[:n, n:])
+
+    return Q
+
+
+def diagonal(*stds: Array | float) -> Array:
+    """``diag(std^2)``: a covariance from standard deviations, given one by one or as vectors, concatenated.
+
+    Example:
+        >>> import jaxfilt as jf
+        >>> jf.diagonal(1.0, 3.0).tolist()
+        [[1.0, 0.0], [0.0, 9.0]]
+    """
+    std = jnp.concatenate([jnp.atleast_1d(jnp.asarray(s)) for s in stds])
+    return jnp.diag(std * std)
+
+
+class Parametrisation(NamedTuple):
+    """A covariance as unconstrained numbers: ``cov(theta)``, and its inverse ``theta(cov)``."""
+
+    cov: Callable[[PyTree], Array]
+    theta: Callable[[Array], PyTree]
+
+
+def _log_std_inverse(cov: Array) -> Array:
+    doors.covariance("cov", cov)
+    if doors.is_concrete(cov) and (np.diag(cov) <= 0).any():
+        raise ValueError(f"cov: expected positive variances, got {np.diag(cov).min():.6g}")
+    return 0.5 * jnp.log(jnp.diagonal(cov))
+
+
+log_std = Parametrisation(lambda theta: jnp.diag(jnp.exp(2 * theta)), _log_std_inverse)
+"""A diagonal covariance from the logarithms (n,) of its standard deviations; the inverse drops correlations."""
+
+
+def log_cholesky(n: int) -> Parametrisation:
+    """A full (n, n) covariance ``L L'`` from n (n + 1) / 2 numbers: L row by row, its diagonal as logarithms.
+
+    Source: Pinheiro, Bates, Unconstrained parametrizations for variance-covariance matrices (1996), section 2.2.
+    """
+    rows, columns = np.tril_indices(n)
+    on_diagonal = rows == columns
+
+    def cov(theta: Array) -> Array:
+        if theta.shape != (len(rows),):
+            raise ValueError(f"theta: expected shape ({len(rows)},), got {theta.shape}")
+        elements = jnp.where(on_diagonal, jnp.exp(jnp.where(on_diagonal, theta, 0.0)), theta)
+        L = jnp.zeros((n, n), theta.dtype).at[rows, columns].set(elements)
+        return L @ L.T
+
+    def theta(cov: Array) -> Array:
+        doors.covariance("cov", cov, n)
+        elements = linalg.cholesky(jnp.asarray(cov))[rows, columns]
+        return jnp.where(on_diagonal, jnp.log(jnp.where(on_diagonal, elements, 1.0)), elements)
+
+    return Parametrisation(cov, theta)
+
+
+def blocks(*parts: tuple[Parametrisation, int]) -> Parametrisation:
+    """A block-diagonal covariance: each part a parametrisation and its dimension; theta is a tuple of their thetas.
+
+    Example: a full block for the position, one number for the clock.
+        >>> import jax.numpy as jnp, jaxfilt as jf
+        >>> R = jf.blocks((jf.log_cholesky(2), 2), (jf.log_std, 1))
+        >>> R.cov(R.theta(jnp.diag(jnp.array([4.0, 1.0, 9.0])))).diagonal().round(4).tolist()
+        [4.0, 1.0, 9.0]
+    """
+    ends = np.cumsum([dim for _, dim in parts]).tolist()
+    starts = [end - dim for end, (_, dim) in zip(ends, parts, strict=True)]
+
+    def cov(theta: tuple) -> Array:
+        return jax.scipy.linalg.block_diag(*[p.cov(t) for (p, _), t in zip(parts, theta, strict=True)])
+
+    def theta(cov: Array) -> tuple:
+        doors.covariance("cov", cov, ends[-1])
+        return tuple(p.theta(cov[i:j, i:j]) for (p, _), i, j in zip(parts, starts, ends, strict=True))
+
+    return Parametrisation(cov, theta)

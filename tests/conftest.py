@@ -1,0 +1,20 @@
+"""JAX at its strictest: no silent rank or dtype promotion; float64 there to ask for."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The recordings; absent, the test skips and says so."""
+    root = os.environ.get("JAXFILT_DATA")
+    if not root:
+        pytest.skip("JAXFILT_DATA is not set: no recordings to run on")
+    return Path(root)
