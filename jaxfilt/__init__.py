@@ -1,5 +1,7 @@
 """jaxfilt: differentiable, batched Kalman filters in JAX."""
 
+from jaxfilt.check import Checkup, check
+from jaxfilt.diagnose import Diagnosis, diagnose
 from jaxfilt.elementary import bearing, cosc, norm, sinc, wrap
 from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
 from jaxfilt.integrate import euler, rk4
@@ -29,6 +31,10 @@ from jaxfilt.types import (
 )
 
 __all__ = [
+    "Checkup",
+    "Diagnosis",
+    "check",
+    "diagnose",
     "Filter",
     "Gaussian",
     "Info",

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from jaxfilt.types import Gaussian, Model, PyTree, Sensor, Space
 
@@ -20,7 +21,7 @@ ROUNDING = 1e3
 
 def is_concrete(x: Any) -> bool:
     """Whether the values of every leaf can be read now."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(x))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
 
 
 def describe(x: PyTree) -> str:
@@ -47,7 +48,7 @@ def point(name: str, x: PyTree, space: Space, leading: tuple[int, ...] = ()) -> 
     """Raise unless x is a point of the space: same structure, shapes and floating dtype."""
     template = space.origin
     if jax.tree.structure(x) != jax.tree.structure(template):
-        raise ValueError(f"{name}: expected a pytree like {describe(template)}, got {describe(x)}")
+        raise ValueError(f"{name}: expected a pytree of shapes {_shapes(template, leading)}, got {describe(x)}")
     for want, got in zip(jax.tree.leaves(template), jax.tree.leaves(x), strict=True):
         expected = leading + np.shape(want)
         if np.shape(got) != expected:
@@ -56,23 +57,21 @@ def point(name: str, x: PyTree, space: Space, leading: tuple[int, ...] = ()) -> 
 
 
 def _shapes(x: PyTree, leading: tuple[int, ...] = ()) -> str:
-    return describe_shapes(jax.tree.map(lambda a: leading + np.shape(a), x), x)
+    return str(jax.tree.map(lambda a: _Word(leading + np.shape(a)), x))
 
 
-def describe_shapes(shapes: PyTree, like: PyTree) -> str:
-    """The shapes of a pytree's leaves, as a tree of tuples."""
-    structure = jax.tree.structure(like)
-    if structure == jax.tree.structure(0):
-        return str(shapes)
-    leaves = structure.flatten_up_to(shapes)
-    return str(structure.unflatten([_Word(s) for s in leaves]))
+def array(name: str, x: Any) -> None:
+    """Raise unless x is an array: a list would only be found out later, inside."""
+    if not (hasattr(x, "shape") and hasattr(x, "dtype")):
+        raise TypeError(f"{name}: expected an array, got {type(x).__name__}")
 
 
-def floating(name: str, x: Any) -> None:
-    """Raise unless x is of a floating dtype; a Python float will do, an int will not."""
-    dtype = getattr(x, "dtype", type(x))
-    if not (dtype is float or np.issubdtype(dtype, np.floating)):
-        raise TypeError(f"{name}: expected floating numbers, got {describe(x)}")
+def floating(name: str, x: PyTree) -> None:
+    """Raise unless all of x is of a floating dtype; a Python float will do, an int will not."""
+    for leaf in jax.tree.leaves(x):
+        dtype = getattr(leaf, "dtype", type(leaf))
+        if not (dtype is float or np.issubdtype(dtype, np.floating)):
+            raise TypeError(f"{name}: expected floating numbers, got {describe(leaf)}")
 
 
 def same_dtype(dtype: Any, **named: PyTree) -> None:
@@ -96,8 +95,33 @@ def finite(name: str, x: PyTree) -> None:
             raise ValueError(f"{name}: expected finite numbers, got {value} at {where} ({bad.sum()} in all)")
 
 
+def leading(name: str, x: PyTree, length: int) -> None:
+    """Raise unless all of x has this leading axis."""
+    for path, leaf in jax.tree.leaves_with_path(x):
+        if np.shape(leaf)[:1] != (length,):
+            where = name + jax.tree_util.keystr(path)
+            raise ValueError(f"{where}: expected leading axis {length}, got shape {np.shape(leaf)}")
+
+
+def increasing(name: str, t: np.ndarray) -> None:
+    """Raise unless t (K,) are finite, strictly increasing stamps, at least one."""
+    if t.ndim != 1 or not len(t):
+        raise ValueError(f"{name}: expected stamps of shape (K,), K >= 1, got shape {t.shape}")
+    finite(name, t)
+    if (np.diff(t) <= 0).any():
+        k = int(np.argmax(np.diff(t) <= 0))
+        raise ValueError(f"{name}: expected strictly increasing stamps, got {t[k]} and then {t[k + 1]} at {k + 1}")
+
+
+def mask(name: str, x: Any, *shapes: tuple[int, ...]) -> None:
+    """Raise unless x is a bool array of one of these shapes."""
+    if not np.issubdtype(getattr(x, "dtype", object), np.bool_) or np.shape(x) not in shapes:
+        raise ValueError(f"{name}: expected bool of shape {' or '.join(map(str, shapes))}, got {describe(x)}")
+
+
 def covariance(name: str, P: Any, dim: int | None = None) -> None:
     """Raise unless P is a (dim, dim) symmetric positive semidefinite matrix, to rounding relative to its own size."""
+    array(name, P)
     shape = np.shape(P)
     if len(shape) != 2 or shape[0] != shape[1] or (dim is not None and shape[0] != dim):
         expected = "square" if dim is None else (dim, dim)
@@ -138,10 +162,8 @@ def belief(name: str, b: Any, space: Space) -> None:
 
 
 def noise(name: str, P: Any, dim: int, dtype: Any) -> None:
-    """Raise unless a model's Q or R came out as a (dim, dim) array of the belief's dtype; its values may be traced."""
-    if np.shape(P) != (dim, dim):
-        raise ValueError(f"{name}: expected shape {(dim, dim)}, got {np.shape(P)}")
-    floating(name, P)
+    """Raise unless a model's Q or R came out as a (dim, dim) covariance of the belief's dtype."""
+    covariance(name, P, dim)
     same_dtype(dtype, **{name: P})
 
 

@@ -27,7 +27,7 @@ def norm(v: jax.Array) -> jax.Array:
 
 def bearing(p: jax.Array) -> jax.Array:
     """Direction atan2(y, x) of a point (2,) (m), rad; at zero distance it is 0 with derivative 0."""
-    somewhere = (p[0] != 0) | (p[1] != 0)
+    somewhere = p @ p > 0  # not p != 0: the derivative divides by this square, which underflows earlier
     return jnp.where(somewhere, jnp.arctan2(p[1], jnp.where(somewhere, p[0], 1.0)), 0.0)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -114,12 +115,12 @@ def build(
     """
     if not model.sensors:
         raise ValueError("model.sensors: expected at least one sensor, got none")
-    thresholds = _thresholds(model, gate)
+    recipe = _Recipe(transform, relinearise or (lambda _: transform), iterations, _thresholds(model, gate))
 
     def predict(belief: Gaussian, u: PyTree = (), dt: Array | float = 0.0) -> Gaussian:
         belief = _canonical(belief, model.space)
-        dt = _interval(dt, belief)
-        return jax.lax.cond(dt > 0, lambda b: _predict(transform, model, b, u, dt), lambda b: b, belief)
+        moves, dt = _interval(dt, belief)
+        return _branch(moves, lambda b: _predict(transform, model, b, u, dt), lambda b: b, belief)
 
     def update(
         belief: Gaussian, z: PyTree, sensor: str, c: PyTree = (), mask: Array | None = None
@@ -128,7 +129,7 @@ def build(
         found = doors.sensor(model, sensor)
         doors.point(f"z[{sensor!r}]", z, found.space)
         doors.same_dtype(belief.cov.dtype, **{f"z[{sensor!r}]": z})
-        return _update(transform, model, sensor, belief, z, c, mask, thresholds.get(sensor), relinearise, iterations)
+        return _update(recipe, model, sensor, belief, z, c, mask)
 
     def step(belief: Gaussian, row: Log) -> tuple[Gaussian, dict[str, Info]]:
         belief = predict(belief, row.u, row.dt)
@@ -141,6 +142,15 @@ def build(
     return Filter(predict, update, step, model)
 
 
+class _Recipe(NamedTuple):
+    """What makes a filter this one: its transform, how its update iterates, its gates' thresholds by sensor."""
+
+    transform: Transform
+    relinearise: Callable[[jax.Array], Transform]
+    iterations: int
+    thresholds: dict[str, np.ndarray]
+
+
 def _canonical(belief: Gaussian, space: Space) -> Gaussian:
     """The belief as arrays of one dtype, that of its covariance; a Python float in the mean is taken along."""
     doors.belief("belief", belief, space)
@@ -148,13 +158,21 @@ def _canonical(belief: Gaussian, space: Space) -> Gaussian:
     return Gaussian(*jax.tree.map(lambda a: jnp.asarray(a, dtype), tuple(belief)))
 
 
-def _interval(dt: Array | float, belief: Gaussian) -> jax.Array:
+def _interval(dt: Array | float, belief: Gaussian) -> tuple[Array | bool, jax.Array]:
+    """Whether time passes, and how much, checked."""
     if np.shape(dt) != ():
         raise ValueError(f"dt: expected a scalar, got shape {np.shape(dt)}")
     if doors.is_concrete(dt) and not 0 <= float(dt) < math.inf:
         raise ValueError(f"dt: expected a finite interval >= 0 s, got {float(dt)}")
     doors.same_dtype(belief.cov.dtype, dt=dt)
-    return jnp.asarray(dt, belief.cov.dtype)
+    return dt > 0, jnp.asarray(dt, belief.cov.dtype)
+
+
+def _branch(predicate: Array | bool, then: Callable, otherwise: Callable, belief: Gaussian) -> Any:
+    """`jax.lax.cond`, decided at once where the predicate is known: outside jit a cond would compile at every call."""
+    if doors.is_concrete(predicate):
+        return then(belief) if predicate else otherwise(belief)
+    return jax.lax.cond(predicate, then, otherwise, belief)
 
 
 def _predict(transform: Transform, model: Model, belief: Gaussian, u: PyTree, dt: jax.Array) -> Gaussian:
@@ -171,16 +189,7 @@ def _predict(transform: Transform, model: Model, belief: Gaussian, u: PyTree, dt
 
 
 def _update(
-    transform: Transform,
-    model: Model,
-    name: str,
-    belief: Gaussian,
-    z: PyTree,
-    c: PyTree,
-    mask: Array | None,
-    thresholds: np.ndarray | None,
-    relinearise: Callable[[jax.Array], Transform] | None,
-    iterations: int,
+    recipe: _Recipe, model: Model, name: str, belief: Gaussian, z: PyTree, c: PyTree, mask: Array | None
 ) -> tuple[Gaussian, Info]:
     sensor, dtype = model.sensors[name], belief.cov.dtype
 
@@ -197,10 +206,11 @@ def _update(
         L = linalg.cholesky(S)
         return m, r, S, L, linalg.gain(cross, L)
 
-    m, r, S, L, K = correct(transform)
+    m, r, S, L, K = correct(recipe.transform)
+    thresholds = recipe.thresholds.get(name)
     info = _report(belief, z, r, S, L, there, thresholds)
-    for _ in range(iterations - 1):
-        m, r, _, _, K = correct(relinearise(K @ r))
+    for _ in range(recipe.iterations - 1):
+        m, r, _, _, K = correct(recipe.relinearise(K @ r))
     moved = _moved(model.space, belief, K @ r, m.remainder(K) + K @ R @ K.T)
     info = info._replace(status=_judge(info.status, moved))
     if thresholds is None:
@@ -289,10 +299,10 @@ def _update_if_there(update: Callable, model: Model, belief: Gaussian, row: Log,
     z, c = row.z[name], row.c.get(name, ())
     if name not in row.valid:
         return update(belief, z, name, c)
-    valid = jnp.asarray(row.valid[name])
-    mask = valid if valid.ndim else None
+    valid = row.valid[name]
+    mask = valid if np.ndim(valid) else None
     nothing = _nothing(model.sensors[name].space.dim, belief.cov.dtype)
-    return jax.lax.cond(jnp.any(valid), lambda b: update(b, z, name, c, mask), lambda b: (b, nothing), belief)
+    return _branch(valid.any(), lambda b: update(b, z, name, c, mask), lambda b: (b, nothing), belief)
 
 
 def _nothing(m: int, dtype: jnp.dtype) -> Info:

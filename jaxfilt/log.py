@@ -5,6 +5,7 @@ Times are absolute float64 seconds until here; only their differences enter a `L
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,12 +13,12 @@ import jax
 import numpy as np
 
 from jaxfilt import doors
-from jaxfilt.types import Log, Model, PyTree, Recording, Space, Stream, Truth
+from jaxfilt.types import Array, Log, Model, PyTree, Recording, Space, Stream, Truth
 
 
 def merge(
     model: Model,
-    streams: Mapping[str, Stream | tuple],
+    streams: Mapping[str, Stream | tuple[Any, ...]],
     u: tuple[np.ndarray, PyTree] | None = None,
     start: float | None = None,
 ) -> Recording:
@@ -48,101 +49,105 @@ def merge(
         >>> rec.t.tolist(), rec.log.dt.tolist(), rec.log.z["z"][:, 0].tolist()
         ([0.0, 0.5], [0.0, 0.5], [1.0, 2.0])
     """
-    named = {name: Stream(*stream) for name, stream in streams.items()}
-    events = []
-    for name in sorted(named):
-        stream = named[name] = _checked(model, name, named[name])
-        events += _events(name, stream)
+    named = {name: _sorted(_checked(model, name, stream)) for name, stream in streams.items()}
     tu, values = _checked_input(u)
-    events += [(t, 0, "", -1) for t in tu]
-    if not events:
+    t, rows = _rows({name: stream.t for name, stream in named.items()}, tu)
+    if not len(t):
         raise ValueError("streams: expected at least one reading or input, got none")
-    rows = sorted({(t, repeat) for t, repeat, _, _ in events})
-    row_of = {row: k for k, row in enumerate(rows)}
-    t = np.array([row[0] for row in rows])
-    start = float(t[0]) if start is None else float(start)
-    if not t[0] >= start:
+    start = float(t[0] if start is None else start)
+    if not -np.inf < start <= t[0]:
         raise ValueError(f"start: expected a time not after the first stamp {t[0]}, got {start}")
     began = np.r_[start, t[:-1]]
 
     z, c, valid = {}, {}, {}
     for name, stream in named.items():
-        at = np.array([row_of[when, repeat] for when, repeat, who, _ in events if who == name], int)
-        order = np.array([index for _, _, who, index in events if who == name], int)
-        z[name] = _scatter(stream.z, at, order, len(t))
+        z[name] = _held(stream.z, model.sensors[name].space.origin, rows[name], len(t))
         if jax.tree.leaves(stream.c):
-            c[name] = _scatter(stream.c, at, order, len(t))
+            first = jax.tree.map(lambda a: a[0] if len(a) else np.zeros(a.shape[1:], a.dtype), stream.c)
+            c[name] = _held(stream.c, first, rows[name], len(t))
         there = np.ones(len(stream.t), bool) if stream.valid is None else stream.valid
-        there = _scatter(there, at, order, len(t))
-        if not there.all():
-            valid[name] = there
+        valid[name] = np.zeros((len(t), *there.shape[1:]), bool)
+        valid[name][rows[name]] = there
     held = np.clip(np.searchsorted(tu, began, side="right") - 1, 0, None)
-    inputs = jax.tree.map(lambda a: np.asarray(a)[held], values)
-    return Recording(_in_default_dtype(Log(t - began, inputs, z, c, valid)), t)
+    inputs = jax.tree.map(lambda a: a[held], values)
+    log = Log(t - began, inputs, z, c, {name: there for name, there in valid.items() if not there.all()})
+    return Recording(_in_default_dtype(log), t)
 
 
-def _checked(model: Model, name: str, stream: Stream) -> Stream:
+def _checked(model: Model, name: str, stream: tuple[Any, ...]) -> Stream:
     space = doors.sensor(model, name).space
-    t = np.asarray(stream.t, np.float64)
-    if t.ndim != 1:
-        raise ValueError(f"t of {name!r}: expected shape (K,), got {t.shape}")
+    if not (isinstance(stream, tuple) and 2 <= len(stream) <= 4):
+        raise TypeError(
+            f"stream of {name!r}: expected Stream(t, z, c, valid) or (t, z[, c[, valid]]), got {type(stream).__name__}"
+        )
+    t, z, c, valid = Stream(*stream)
+    t = _seconds(f"t of {name!r}", t)
+    z, c = jax.tree.map(np.asarray, (z, c))
+    valid = None if valid is None else np.asarray(valid)
     doors.finite(f"t of {name!r}", t)
-    z = jax.tree.map(np.asarray, stream.z)
-    valid = None if stream.valid is None else _checked_valid(name, np.asarray(stream.valid), len(t), space)
-    doors.point(f"z of {name!r}", z, space, leading=(len(t),))
+    doors.point(f"z of {name!r}", z, space, leading=t.shape)
+    if valid is not None:
+        doors.mask(f"valid of {name!r}", valid, t.shape, (*t.shape, space.dim))
     try:
         doors.finite(f"z of {name!r}", z)
     except ValueError as bad:
         raise ValueError(f"{bad}; put any finite number there and mark it in valid") from None
-    for leaf in jax.tree.leaves(stream.c):
-        if np.shape(leaf)[:1] != (len(t),):
-            raise ValueError(f"c of {name!r}: expected leading axis {len(t)}, got shape {np.shape(leaf)}")
-    doors.finite(f"c of {name!r}", stream.c)
-    return Stream(t, z, jax.tree.map(np.asarray, stream.c), valid)
+    doors.leading(f"c of {name!r}", c, len(t))
+    doors.finite(f"c of {name!r}", c)
+    return Stream(t, z, c, valid)
 
 
-def _checked_valid(name: str, valid: np.ndarray, length: int, space: Space) -> np.ndarray:
-    if valid.dtype != bool or valid.shape not in ((length,), (length, space.dim)):
-        raise ValueError(
-            f"valid of {name!r}: expected bool of shape {(length,)} or {(length, space.dim)}, got {doors.describe(valid)}"
-        )
-    return valid
+def _seconds(name: str, t: Any) -> np.ndarray:
+    t = np.asarray(t)
+    if t.ndim != 1 or not np.issubdtype(t.dtype, np.number):
+        raise ValueError(f"{name}: expected seconds as numbers of shape (K,), got {doors.describe(t)}")
+    return t.astype(np.float64)
 
 
 def _checked_input(u: tuple[np.ndarray, PyTree] | None) -> tuple[np.ndarray, PyTree]:
     if u is None:
         return np.zeros(0), ()
-    t = np.asarray(u[0], np.float64)
-    doors.finite("t of u", t)
-    if t.ndim != 1 or not len(t) or (np.diff(t) <= 0).any():
-        raise ValueError(f"t of u: expected strictly increasing stamps, got {t}")
-    for leaf in jax.tree.leaves(u[1]):
-        if np.shape(leaf)[:1] != (len(t),):
-            raise ValueError(f"u: expected leading axis {len(t)} like its stamps, got shape {np.shape(leaf)}")
-        doors.floating("u", np.asarray(leaf))
-    doors.finite("u", u[1])
-    return t, u[1]
+    if not (isinstance(u, tuple) and len(u) == 2):
+        raise TypeError(f"u: expected (t, values), got {doors.describe(u)}")
+    t, values = _seconds("t of u", u[0]), jax.tree.map(np.asarray, u[1])
+    doors.increasing("t of u", t)
+    doors.leading("u", values, len(t))
+    doors.floating("u", values)
+    doors.finite("u", values)
+    return t, values
 
 
-def _events(name: str, stream: Stream) -> list[tuple[float, int, str, int]]:
-    """(time, how many of this sensor's readings share it and come before, sensor, index), ties by value."""
-    keys = [np.reshape(leaf, (len(stream.t), -1)).T for leaf in jax.tree.leaves((stream.z, stream.c))]
-    keys += [] if stream.valid is None else [np.reshape(stream.valid, (len(stream.t), -1)).T]
-    order = np.lexsort([*np.concatenate(keys)[::-1], stream.t])
-    events, repeat = [], 0
-    for before, index in zip([None, *order[:-1]], order, strict=False):
-        repeat = repeat + 1 if before is not None and stream.t[before] == stream.t[index] else 0
-        events.append((float(stream.t[index]), repeat, name, int(index)))
-    return events
+def _sorted(stream: Stream) -> Stream:
+    """In order of time; readings with the same stamp in order of value, so that arrival does not matter."""
+    leaves = jax.tree.leaves((stream.z, stream.c, stream.valid))
+    keys = np.concatenate([leaf.reshape(len(stream.t), math.prod(leaf.shape[1:])).T for leaf in leaves])
+    order = np.lexsort([*keys[::-1], stream.t])
+    return jax.tree.map(lambda a: a[order], stream)
 
 
-def _scatter(tree: PyTree, rows: np.ndarray, order: np.ndarray, length: int) -> PyTree:
-    def one(values: np.ndarray) -> np.ndarray:
-        out = np.zeros((length, *values.shape[1:]), values.dtype)
-        out[rows] = values[order]
-        return out
+def _rows(stamps: Mapping[str, np.ndarray], inputs: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The times of the rows, and for each sensor the rows of its readings, whose sorted stamps are given.
 
-    return jax.tree.map(one, tree)
+    A time has as many rows as the sensor with the most readings there: the k-th of each sensor share the k-th row.
+    """
+    times = np.unique(np.concatenate([inputs, *stamps.values()]))
+    at = {name: np.searchsorted(times, t) for name, t in stamps.items()}
+    repeat = {name: np.arange(len(t)) - np.searchsorted(t, t) for name, t in stamps.items()}
+    count = np.ones(len(times), int)
+    for name in stamps:
+        np.maximum.at(count, at[name], repeat[name] + 1)
+    first = np.cumsum(count) - count
+    return np.repeat(times, count), {name: first[at[name]] + repeat[name] for name in stamps}
+
+
+def _held(readings: PyTree, before: PyTree, rows: np.ndarray, length: int) -> PyTree:
+    """Each row's latest reading, ``before`` where there is none yet.
+
+    It stands in rows that are marked invalid. A batch computes their updates too before it drops them, and from
+    anything but a proper reading (a quaternion of zeros) reverse mode would bring back NaN.
+    """
+    latest = np.searchsorted(rows, np.arange(length), side="right")
+    return jax.tree.map(lambda a, a0: np.concatenate([np.asarray(a0, a.dtype)[None], a])[latest], readings, before)
 
 
 def _in_default_dtype(log: Log) -> Log:
@@ -169,7 +174,7 @@ def schedule(
         c: sensor -> context, leading axis T.
 
     Raises:
-        ValueError: steps < 1, dt <= 0, a negative interval, leading axes that are not T.
+        ValueError: steps < 1, dt <= 0, ``every`` negative or no whole number, leading axes that are not T.
         KeyError: a sensor that the model lacks.
 
     Example: an odometer at 50 Hz, GNSS at 10 Hz.
@@ -183,11 +188,12 @@ def schedule(
         raise ValueError(f"steps: expected at least 1, got {steps}")
     if not 0 < dt < np.inf:
         raise ValueError(f"dt: expected a finite interval > 0 s, got {dt}")
-    every = dict(every or {})
-    for name, k in every.items():
+    every, c = dict(every or {}), dict(c or {})
+    for name in (*every, *c):
         doors.sensor(model, name)
-        if k < 0:
-            raise ValueError(f"every[{name!r}]: expected a number of rows >= 0, got {k}")
+    for name, k in every.items():
+        if k < 0 or k != int(k):
+            raise ValueError(f"every[{name!r}]: expected a whole number of rows >= 0, got {k}")
     z, valid = {}, {}
     for name, sensor in model.sensors.items():
         k = every.get(name, 1)
@@ -196,11 +202,8 @@ def schedule(
         z[name] = jax.tree.map(lambda a: np.broadcast_to(a, (steps, *np.shape(a))).copy(), sensor.space.origin)
         if k > 1:
             valid[name] = np.arange(1, steps + 1) % k == 0
-    for name, tree in {"u": u, **{f"c[{name!r}]": tree for name, tree in (c or {}).items()}}.items():
-        for leaf in jax.tree.leaves(tree):
-            if np.shape(leaf)[:1] != (steps,):
-                raise ValueError(f"{name}: expected leading axis {steps}, got shape {np.shape(leaf)}")
-    log = Log(np.full(steps, dt), jax.tree.map(np.asarray, u), z, jax.tree.map(np.asarray, dict(c or {})), valid)
+    log = Log(np.full(steps, dt), jax.tree.map(np.asarray, u), z, jax.tree.map(np.asarray, c), valid)
+    doors.leading("log", log, steps)
     return _in_default_dtype(log)
 
 
@@ -217,37 +220,35 @@ def validate(model: Model, log: Log, dtype: Any = None) -> None:
     """
     if not isinstance(log, Log):
         raise TypeError(f"log: expected a Log, got {type(log).__name__}")
-    if np.ndim(log.dt) != 1:
-        raise ValueError(f"log.dt: expected shape (T,), got {np.shape(log.dt)}")
-    length = np.shape(log.dt)[0]
+    for field in ("z", "c", "valid"):
+        if not isinstance(getattr(log, field), Mapping):
+            raise TypeError(f"log.{field}: expected a dict by sensor, got {doors.describe(getattr(log, field))}")
+    doors.array("log.dt", log.dt)
+    if log.dt.ndim != 1:
+        raise ValueError(f"log.dt: expected shape (T,), got {log.dt.shape}")
+    length = len(log.dt)
     if length == 0:
         raise ValueError("log: expected at least one row, got none")
-    dtype = jax.dtypes.canonicalize_dtype(log.dt.dtype if dtype is None else dtype)
+    doors.leading("log", log, length)
     doors.floating("log.dt", log.dt)
     doors.finite("log.dt", log.dt)
     if doors.is_concrete(log.dt) and (np.asarray(log.dt) < 0).any():
         k = int(np.argmax(np.asarray(log.dt) < 0))
         raise ValueError(f"log.dt: expected intervals >= 0 s, got {np.asarray(log.dt)[k]} at row {k}")
-    for leaf in jax.tree.leaves(log):
-        if np.shape(leaf)[:1] != (length,):
-            raise ValueError(f"log: expected leading axis {length} everywhere, got shape {np.shape(leaf)}")
     for name, z in log.z.items():
-        space = doors.sensor(model, name).space
-        doors.point(f"log.z[{name!r}]", z, space, leading=(length,))
-        doors.finite(f"log.z[{name!r}]", z)
+        doors.point(f"log.z[{name!r}]", z, doors.sensor(model, name).space, leading=(length,))
     for field, table in {"c": log.c, "valid": log.valid}.items():
         for name in table:
             if name not in log.z:
                 raise KeyError(f"log.{field}: expected sensors of log.z, {list(log.z)}, got {name!r}")
     for name, valid in log.valid.items():
-        dim = model.sensors[name].space.dim
-        if valid.dtype != bool or valid.shape not in ((length,), (length, dim)):
-            raise ValueError(
-                f"log.valid[{name!r}]: expected bool of shape {(length,)} or {(length, dim)}, got {doors.describe(valid)}"
-            )
-    doors.finite("log.u", log.u)
-    doors.finite("log.c", log.c)
-    doors.same_dtype(dtype, **{"log.dt": log.dt, "log.u": log.u, "log.z": log.z, "log.c": log.c})
+        doors.mask(f"log.valid[{name!r}]", valid, (length,), (length, model.sensors[name].space.dim))
+    doors.floating("log.u", log.u)
+    named = {"log.u": log.u} | {f"log.{f}[{name!r}]": tree for f in "zc" for name, tree in getattr(log, f).items()}
+    for name, tree in named.items():
+        doors.finite(name, tree)
+    dtype = jax.dtypes.canonicalize_dtype(log.dt.dtype if dtype is None else dtype)
+    doors.same_dtype(dtype, **{"log.dt": log.dt}, **named)
 
 
 def stack(logs: Sequence[Log]) -> Log:
@@ -271,15 +272,27 @@ def stack(logs: Sequence[Log]) -> Log:
                 f"logs: expected one structure, got {jax.tree.structure(full[0])} and {jax.tree.structure(log)}"
             )
 
-    def padded(a: np.ndarray) -> np.ndarray:
-        return np.concatenate([a, np.zeros((length - len(a), *a.shape[1:]), a.dtype)])
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *[_padded(log, length) for log in full])
 
-    return jax.tree.map(lambda *rows: np.stack([padded(np.asarray(a)) for a in rows]), *full)
+
+def _padded(log: Log, length: int) -> Log:
+    """More rows in which nothing happens; for what `_held` says, they repeat the last one's input and readings."""
+    more = length - len(log.dt)
+
+    def repeated(a: Array) -> np.ndarray:
+        return np.concatenate([a, np.repeat(np.asarray(a)[-1:], more, axis=0)])
+
+    log = jax.tree.map(repeated, log)
+    log.dt[length - more :] = 0
+    for valid in log.valid.values():
+        valid[length - more :] = False
+    return log
 
 
 def _explicit(logs: Sequence[Log], log: Log, name: str) -> np.ndarray:
     """The mask of a sensor written out, by component if any of the logs has it so."""
-    by_component = [other.valid[name].shape[1] for other in logs if np.ndim(other.valid.get(name)) == 2]
+    masks = [np.asarray(other.valid[name]) for other in logs if name in other.valid]
+    by_component = [mask.shape[1] for mask in masks if mask.ndim == 2]
     valid = np.asarray(log.valid.get(name, np.ones(len(log.dt), bool)))
     if by_component and valid.ndim == 1:
         return np.repeat(valid[:, None], by_component[0], axis=1)
@@ -296,22 +309,26 @@ def align(t: np.ndarray, truth: tuple[np.ndarray, PyTree], space: Space, gap: fl
         gap: s; between truth samples further apart than this, the mask is False.
 
     Returns:
-        Truth(x, mask): x with leading axis T; mask False outside the truth's time and within gaps.
+        Truth(x, mask): x with leading axis T; mask False outside the truth's time and inside gaps.
 
     Raises:
-        ValueError: stamps that are not finite or not increasing, fewer than two samples.
+        ValueError: stamps that are not finite or not increasing, fewer than two samples, NaN in the points (leave such
+            samples out; ``gap`` masks where they were).
     """
-    stamps = np.asarray(truth[0], np.float64)
-    doors.finite("t of truth", stamps)
-    if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
-        raise ValueError(f"t of truth: expected at least two strictly increasing stamps, got {stamps}")
-    doors.point("truth", jax.tree.map(np.asarray, truth[1]), space, leading=(len(stamps),))
-    t = np.asarray(t, np.float64)
+    stamps = _seconds("t of truth", truth[0])
+    doors.increasing("t of truth", stamps)
+    if len(stamps) < 2:
+        raise ValueError(f"t of truth: expected at least two stamps, got {stamps}")
+    points = jax.tree.map(np.asarray, truth[1])
+    doors.point("truth", points, space, leading=stamps.shape)
+    doors.finite("truth", points)
+    t = _seconds("t", t)
     after = np.clip(np.searchsorted(stamps, t, side="right"), 1, len(stamps) - 1)
     width = stamps[after] - stamps[after - 1]
     share = np.clip((t - stamps[after - 1]) / width, 0.0, 1.0)
     dtype = jax.dtypes.canonicalize_dtype(float)
-    a, b = (jax.tree.map(lambda x, i=i: np.asarray(x, dtype)[i], truth[1]) for i in (after - 1, after))
+    a, b = (jax.tree.map(lambda x, i=i: x[i].astype(dtype), points) for i in (after - 1, after))
     between = jax.vmap(lambda a, b, s: space.plus(a, s * space.minus(b, a)))
-    inside = (t >= stamps[0]) & (t <= stamps[-1]) & (width <= gap)
-    return Truth(jax.tree.map(np.asarray, between(a, b, share.astype(dtype))), inside)
+    inside = (t >= stamps[0]) & (t <= stamps[-1])
+    known = (width <= gap) | (share == 0) | (share == 1)
+    return Truth(jax.tree.map(np.asarray, between(a, b, share.astype(dtype))), inside & known)

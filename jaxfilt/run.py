@@ -77,9 +77,13 @@ def scan_runs(
     unknown = [name for name in batched if name not in Log._fields]
     if unknown:
         raise ValueError(f"batched: expected fields of {Log._fields}, got {unknown}")
-    axes: Any = Log(*[0 if name in batched else None for name in Log._fields])
     belief_axis = 0 if jnp.ndim(belief.cov) == 3 else None
-    return jax.vmap(lambda b, rows: scan(filter, b, rows, store), in_axes=(belief_axis, axes))(belief, log)
+    axes = tuple(0 if name in batched else None for name in Log._fields)
+
+    def one(b: Gaussian, *fields: PyTree) -> Any:
+        return scan(filter, b, Log(*fields), store)
+
+    return jax.vmap(one, in_axes=(belief_axis, *axes))(belief, *log)
 
 
 def log_likelihood(filter: Filter, belief: Gaussian, log: Log) -> jax.Array:
