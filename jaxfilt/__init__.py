@@ -7,6 +7,7 @@ from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
 from jaxfilt.integrate import euler, rk4
 from jaxfilt.log import align, merge, schedule, stack, validate
 from jaxfilt.models.linear import linear
+from jaxfilt.models.sensors import range_bearing
 from jaxfilt.noise import Parametrisation, blocks, const, diagonal, log_cholesky, log_std, van_loan, white
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
 from jaxfilt.simulate import Simulation, sample, simulate
@@ -33,8 +34,6 @@ from jaxfilt.types import (
 __all__ = [
     "Checkup",
     "Diagnosis",
-    "check",
-    "diagnose",
     "Filter",
     "Gaussian",
     "Info",
@@ -57,10 +56,12 @@ __all__ = [
     "bearing",
     "blocks",
     "build",
+    "check",
     "ckf",
     "const",
     "cosc",
     "cubature",
+    "diagnose",
     "diagonal",
     "ekf",
     "euler",
@@ -76,6 +77,7 @@ __all__ = [
     "merge",
     "norm",
     "product",
+    "range_bearing",
     "rk4",
     "rotate",
     "rotate_back",

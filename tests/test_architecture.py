@@ -5,8 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jaxfilt
 import pytest
+
+import jaxfilt
 
 ROOT = Path(jaxfilt.__file__).parent
 FLOORS = [

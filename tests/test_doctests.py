@@ -5,8 +5,9 @@ import importlib
 import pkgutil
 
 import jax
-import jaxfilt
 import pytest
+
+import jaxfilt
 
 MODULES = [m.name for m in pkgutil.walk_packages(jaxfilt.__path__, "jaxfilt.")]
 
