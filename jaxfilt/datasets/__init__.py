@@ -6,7 +6,7 @@ Each reader's docstring says what was recorded, in which units and frames; `load
 from __future__ import annotations
 
 from jaxfilt.datasets import cars, multirotors, robots
-from jaxfilt.datasets.files import VARIABLE, Dataset, Source, root
+from jaxfilt.datasets.common import VARIABLE, Dataset, Source, root
 
 _SOURCES: dict[str, Source] = {**cars.SOURCES, **robots.SOURCES, **multirotors.SOURCES}
 

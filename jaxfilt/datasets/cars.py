@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfilt.datasets import geodesy
-from jaxfilt.datasets.files import Contents, Source, arrays, increasing, named_columns, table, tagged_rows
+from jaxfilt.datasets.common import Contents, Source, arrays, increasing, named_columns, table, tagged_rows
 from jaxfilt.types import Stream
 
 

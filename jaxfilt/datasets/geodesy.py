@@ -22,10 +22,11 @@ _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
 class LocalFrame(NamedTuple):
-    """East, north, up about a point: ``origin`` (3,) m Earth-centred, ``axes`` (3, 3), whose rows are e, n, u."""
+    """East, north, up about a point: ``origin`` (3,) m, Earth-centred, at ``latitude`` and ``longitude``, rad."""
 
     origin: np.ndarray
-    axes: np.ndarray
+    latitude: float
+    longitude: float
 
     def position(self, p: np.ndarray) -> np.ndarray:
         """Earth-centred points (K, 3), m, in this frame."""
@@ -33,24 +34,35 @@ class LocalFrame(NamedTuple):
 
     def direction(self, v: np.ndarray) -> np.ndarray:
         """Earth-centred vectors (K, 3) in this frame."""
-        return v @ self.axes.T
+        sin_lat, cos_lat = np.sin(self.latitude), np.cos(self.latitude)
+        sin_lon, cos_lon = np.sin(self.longitude), np.cos(self.longitude)
+        east = [-sin_lon, cos_lon, 0.0]
+        north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+        up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+        return v @ np.array([east, north, up]).T
 
     def attitude(self, q: np.ndarray) -> np.ndarray:
-        """Quaternions (K, 4), (w, x, y, z), body to Earth-centred, as body to this frame."""
-        w, x, y, z = q.T
-        rotation = _quaternion(self.axes)
-        columns = np.stack([np.stack(c) for c in ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))])
-        return np.einsum("ijk,j->ki", columns, rotation)
+        """Quaternions (K, 4), (w, x, y, z), body to Earth-centred, as body to this frame.
+
+        This frame is the Earth-centred one turned by longitude + 90 deg about z, then by 90 deg - latitude about x.
+        """
+        about_z, about_x = 0.5 * (self.longitude + np.pi / 2), 0.5 * (np.pi / 2 - self.latitude)
+        back_x = np.array([np.cos(about_x), -np.sin(about_x), 0.0, 0.0])
+        back_z = np.array([np.cos(about_z), 0.0, 0.0, -np.sin(about_z)])
+        return _quaternion_product(back_x, _quaternion_product(back_z, q))
 
 
 def local_frame(origin: np.ndarray) -> LocalFrame:
     """The frame about an Earth-centred point (3,), m."""
     latitude, longitude, _ = geodetic(origin)
-    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
-    east = [-sin_lon, cos_lon, 0.0]
-    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
-    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
-    return LocalFrame(np.asarray(origin, float), np.array([east, north, up]))
+    return LocalFrame(np.asarray(origin, float), latitude, longitude)
+
+
+def _quaternion_product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Hamilton product of one quaternion (4,) with many (K, 4), (w, x, y, z)."""
+    scalar = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
+    vector = p[0] * q[:, 1:] + q[:, :1] * p[1:] + np.cross(p[1:], q[:, 1:])
+    return np.concatenate([scalar[:, None], vector], axis=1)
 
 
 def earth_centred(latitude: np.ndarray, longitude: np.ndarray, height: np.ndarray) -> np.ndarray:
@@ -87,17 +99,3 @@ def sagnac(satellites: np.ndarray, receiver: np.ndarray) -> np.ndarray:
         receiver: (3,) m, Earth-centred.
     """
     return EARTH_RATE / LIGHT * (satellites[:, 0] * receiver[1] - satellites[:, 1] * receiver[0])
-
-
-def _quaternion(axes: np.ndarray) -> np.ndarray:
-    """The unit quaternion of a rotation matrix: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
-    R = axes
-    K = np.array(
-        [
-            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
-            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], R[2, 1] + R[1, 2]],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(K)[1][:, -1]

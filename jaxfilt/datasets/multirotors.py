@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfilt.datasets.files import (
+from jaxfilt.datasets.common import (
     Contents,
     Source,
     arrays,
@@ -69,8 +69,8 @@ def ansfl_phantom4(folder: Path, sequence: str) -> Contents:
         imu = a[f"IMU_{k}"]
         t = imu[:, 0] - offset
         streams[f"euler_{k}"] = Stream(t, np.radians(imu[:, 1:4]))
-        inputs[f"accelerometer_{k}"] = (t, imu[:, 4:7])
-        inputs[f"gyro_{k}"] = (t, np.radians(imu[:, 7:10]))
+        inputs[f"accelerometer_{k}"] = increasing(t, imu[:, 4:7])
+        inputs[f"gyro_{k}"] = increasing(t, np.radians(imu[:, 7:10]))
     g = a["GT"]
     truth = {
         "pos": g[:, [8, 7, 6]],
@@ -134,7 +134,13 @@ def euroc_mav(folder: Path, sequence: str) -> Contents:
     else:
         g = table(folder / "groundtruth.csv.gz", delimiter=",")
         t_truth = g[:, 0] * 1e-9
-        blocks = {"pos": (1, 4), "attitude": (4, 8), "vel": (8, 11), "gyro_bias": (11, 14), "accelerometer_bias": (14, 17)}
+        blocks = {
+            "pos": (1, 4),
+            "attitude": (4, 8),
+            "vel": (8, 11),
+            "gyro_bias": (11, 14),
+            "accelerometer_bias": (14, 17),
+        }
         truth = {name: g[:, i:j] for name, (i, j) in blocks.items()}
     if sequence == "V2_03_difficult":
         offset, a = -0.196, table(folder / "vicon0.csv.gz", delimiter=",")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfilt.datasets.files import Contents, Source, arrays, increasing, sensed, table, tagged_rows
+from jaxfilt.datasets.common import Contents, Source, arrays, increasing, sensed, table, tagged_rows
 from jaxfilt.types import Stream
 
 
@@ -46,6 +46,7 @@ def nclt_1hz(folder: Path, sequence: str) -> Contents:
     Streams: ``gps`` and ``rtk`` (2,) m, missing where there is no new fix; ``heading`` rad and ``turn_rate`` rad/s
     of the IMU. GPS errors are heavy-tailed and correlated in time. Inputs: ``wheels`` (2,) left, right, m/s.
     Truth: ``pos`` (2,) m and ``yaw`` rad, of lidar scan matching and RTK GPS, a decimetre or so.
+    Constants: ``start`` (2,) m, where the authors of the resampled files let their filters begin.
     Frame: (north, east), heading from north to east. Time: seconds of the run, row k is second k.
     """
     a = arrays(folder / f"{sequence}.npz")
@@ -57,7 +58,10 @@ def nclt_1hz(folder: Path, sequence: str) -> Contents:
         "turn_rate": Stream(t, a["wheel"][:, 3]),
     }
     return Contents(
-        streams, {"wheels": (t, a["wheel"][:, :2])}, {"pos": (t, a["truth_xy"]), "yaw": (t, a["truth_heading"])}, {}
+        streams,
+        {"wheels": (t, a["wheel"][:, :2])},
+        {"pos": (t, a["truth_xy"]), "yaw": (t, a["truth_heading"])},
+        {"start": a["initial_state"][:2]},
     )
 
 

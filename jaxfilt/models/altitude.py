@@ -110,7 +110,7 @@ def vertical_drone_scenario() -> Scenario:
 
 
 def table_drone_scenario() -> Scenario:
-    """The same flight, above a table of 0.75 m in the second half of every 4 s."""
+    """The same flight, with a table of 0.75 m below in the second half of every 4 s; range at 30 Hz."""
 
     def fly(steps: int) -> Log:
         over = VERTICAL_DT * np.arange(steps) % 4 >= 2
@@ -126,7 +126,7 @@ def _bobbing(steps: int) -> Vertical:
 
 
 def vertical_control(x: Vertical, wanted: Vertical) -> Array:
-    """Upward acceleration, () m/s^2: ``4 (height_wanted - height) + 4 (climb_wanted - climb)``, a double pole at 2/s."""
+    """Upward acceleration, () m/s^2: ``4 (height error) + 4 (climb error)``, a double pole at 2/s."""
     return 4.0 * (wanted.height - x.height) + 4.0 * (wanted.climb - x.climb)
 
 

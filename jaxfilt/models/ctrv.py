@@ -51,7 +51,7 @@ BICYCLIST = {
     "turn": math.log(0.1),  # (rad/s)/sqrt(s): likewise 0.3 to 0.6 rad/s^2
     "lidar": math.log(0.15),  # m: the values handed out with the udacity recording
     "radar": (math.log(0.3), math.log(0.03), math.log(0.3)),  # m, rad, m/s: likewise
-    "start": (math.log(1.0), math.log(1.0), math.log(0.3), math.log(1.0), math.log(0.2)),  # m, m, rad, m/s, rad/s
+    "start": (math.log(0.5), math.log(0.5), math.log(0.1), math.log(0.5), math.log(0.05)),  # m, m, rad, m/s, rad/s
 }
 """A bicycle among cars, seen by a car's lidar and radar: ``theta`` of `ctrv`."""
 
@@ -78,7 +78,7 @@ def ctrv(theta: PyTree = BICYCLIST) -> Model:
         [10.0, 0.0]
 
     Source: Schubert, Richter, Wanielik, Comparison and evaluation of advanced motion models for vehicle tracking
-    (2008), eq. 11, with the chord in place of the quotients.
+    (2008), the CTRV model, with the chord in place of its quotients.
     """
     std = jax.tree.map(jnp.exp, theta)
 

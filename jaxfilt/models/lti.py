@@ -45,8 +45,8 @@ def lti(theta: PyTree = LTI) -> Model:
 
     Example:
         >>> import jax.numpy as jnp
-        >>> lti().f(jnp.array([0.0, 1.0]), jnp.array([0.0]), 0.01).round(4).tolist()
-        [0.01, 0.99]
+        >>> lti().f(jnp.array([1.0, 0.0]), jnp.array([100.0]), 0.01).tolist()
+        [1.0, 1.0]
     """
     std = jax.tree.map(jnp.exp, theta)
     dtype = std["position"].dtype
@@ -62,7 +62,7 @@ def lti_start(theta: PyTree = LTI) -> Gaussian:
 
 
 def lti_scenario(sensor: str = "position") -> Scenario:
-    """A push to and fro for ten seconds, measured by "position" or by "both" in each step."""
+    """Pushed to and fro, with "position" or "both" measured in each step of 0.01 s."""
 
     def run(steps: int) -> Log:
         every = {name: int(name == sensor) for name in ("position", "both")}
@@ -120,7 +120,7 @@ def hidden_bias_start(theta: PyTree = HIDDEN_BIAS) -> Gaussian:
 
 
 def hidden_bias_scenario(sensor: str = "position") -> Scenario:
-    """A push to and fro, measured by "position" or by "velocity" in each step."""
+    """Pushed to and fro against a hidden bias, with "position" or "velocity" measured in each step of 0.01 s."""
 
     def run(steps: int) -> Log:
         every = {name: int(name == sensor) for name in ("position", "velocity")}
