@@ -3,6 +3,7 @@
 from jaxfilt.check import Checkup, check
 from jaxfilt.diagnose import Diagnosis, diagnose
 from jaxfilt.elementary import bearing, cosc, norm, sinc, wrap
+from jaxfilt.files import load, save
 from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
 from jaxfilt.integrate import euler, rk4
 from jaxfilt.log import align, merge, schedule, stack, validate
@@ -12,6 +13,7 @@ from jaxfilt.noise import Parametrisation, blocks, const, diagonal, log_cholesky
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
 from jaxfilt.simulate import Simulation, sample, simulate
 from jaxfilt.spaces import angle, product, rotate, rotate_back, scalar, so2, so3, so3_exp, so3_log, vector
+from jaxfilt.study import Study, study
 from jaxfilt.transforms import cubature, gauss_hermite, taylor, unscented
 from jaxfilt.types import (
     Filter,
@@ -49,6 +51,7 @@ __all__ = [
     "Space",
     "Status",
     "Stream",
+    "Study",
     "Track",
     "Truth",
     "align",
@@ -69,6 +72,7 @@ __all__ = [
     "iekf",
     "kf",
     "linear",
+    "load",
     "log_cholesky",
     "log_likelihood",
     "log_std",
@@ -82,6 +86,7 @@ __all__ = [
     "rotate",
     "rotate_back",
     "sample",
+    "save",
     "scalar",
     "scan",
     "scan_runs",
@@ -93,6 +98,7 @@ __all__ = [
     "so3_exp",
     "so3_log",
     "stack",
+    "study",
     "taylor",
     "ukf",
     "unscented",

@@ -7,13 +7,14 @@ program. Values are checked where they are there to see: outside `jit`. What goe
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxfilt.types import Gaussian, Model, PyTree, Sensor, Space
+from jaxfilt.types import Gaussian, Log, Model, PyTree, Sensor, Space
 
 ROUNDING = 1e3
 """Times n * eps of its own size that a covariance may be off symmetry or below zero and still count as rounding."""
@@ -60,10 +61,24 @@ def _shapes(x: PyTree, leading: tuple[int, ...] = ()) -> str:
     return str(jax.tree.map(lambda a: _Word(leading + np.shape(a)), x))
 
 
+def instance(name: str, x: Any, kind: type) -> None:
+    """Raise unless x is of this kind."""
+    if not isinstance(x, kind):
+        raise TypeError(f"{name}: expected a {kind.__name__}, got {type(x).__name__}")
+
+
 def array(name: str, x: Any) -> None:
     """Raise unless x is an array: a list would only be found out later, inside."""
     if not (hasattr(x, "shape") and hasattr(x, "dtype")):
         raise TypeError(f"{name}: expected an array, got {type(x).__name__}")
+
+
+def matrix(name: str, M: Any) -> None:
+    """Raise unless M is a matrix of a floating dtype."""
+    array(name, M)
+    floating(name, M)
+    if np.ndim(M) != 2:
+        raise ValueError(f"{name}: expected a matrix, got shape {np.shape(M)}")
 
 
 def floating(name: str, x: PyTree) -> None:
@@ -114,8 +129,8 @@ def increasing(name: str, t: np.ndarray) -> None:
 
 
 def mask(name: str, x: Any, *shapes: tuple[int, ...]) -> None:
-    """Raise unless x is a bool array of one of these shapes."""
-    if not np.issubdtype(getattr(x, "dtype", object), np.bool_) or np.shape(x) not in shapes:
+    """Raise unless x is bool, of one of these shapes."""
+    if not np.issubdtype(getattr(x, "dtype", type(x)), np.bool_) or np.shape(x) not in shapes:
         raise ValueError(f"{name}: expected bool of shape {' or '.join(map(str, shapes))}, got {describe(x)}")
 
 
@@ -165,6 +180,36 @@ def noise(name: str, P: Any, dim: int, dtype: Any) -> None:
     """Raise unless a model's Q or R came out as a (dim, dim) covariance of the belief's dtype."""
     covariance(name, P, dim)
     same_dtype(dtype, **{name: P})
+
+
+def inputs(name: str, u: PyTree, dtype: Any) -> None:
+    """Raise unless an input is made of finite floating numbers of the belief's dtype."""
+    floating(name, u)
+    finite(name, u)
+    same_dtype(dtype, **{name: u})
+
+
+def tables(name: str, log: Log, model: Model) -> None:
+    """Raise unless z, c and valid of a log, or of one row, are dicts by the model's sensors."""
+    instance(name, log, Log)
+    for field in ("z", "c", "valid"):
+        table = getattr(log, field)
+        if not isinstance(table, Mapping):
+            raise TypeError(f"{name}.{field}: expected a dict by sensor, got {describe(table)}")
+        for key in table:
+            sensor(model, key)
+            if key not in log.z:
+                raise KeyError(f"{name}.{field}: expected sensors of {name}.z, {list(log.z)}, got {key!r}")
+
+
+def call(name: str, function: Callable, **arguments: Any) -> Any:
+    """What a user's function returns; where it raises, a note on the error says for what."""
+    try:
+        return function(*arguments.values())
+    except Exception as error:
+        given = ", ".join(f"{key} = {describe(value)}" for key, value in arguments.items())
+        error.add_note(f"raised by {name} for {given}")
+        raise
 
 
 def sensor(model: Model, name: str) -> Sensor:

@@ -8,6 +8,7 @@ the keys of a dict. Something empty is written as text: ``u`` is "()" where ther
 from __future__ import annotations
 
 import ast
+import contextlib
 import os
 import re
 import uuid
@@ -121,7 +122,8 @@ def _write(path: Path, arrays: dict[str, Any]) -> None:
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:

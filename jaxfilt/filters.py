@@ -113,12 +113,14 @@ def build(
         relinearise: offset (n,) -> transform about ``mean + offset``, for updates with more than one iteration.
         iterations: linearisations per update.
     """
+    doors.instance("model", model, Model)
     if not model.sensors:
         raise ValueError("model.sensors: expected at least one sensor, got none")
     recipe = _Recipe(transform, relinearise or (lambda _: transform), iterations, _thresholds(model, gate))
 
     def predict(belief: Gaussian, u: PyTree = (), dt: Array | float = 0.0) -> Gaussian:
         belief = _canonical(belief, model.space)
+        doors.inputs("u", u, belief.cov.dtype)
         moves, dt = _interval(dt, belief)
         return _branch(moves, lambda b: _predict(transform, model, b, u, dt), lambda b: b, belief)
 
@@ -128,10 +130,12 @@ def build(
         belief = _canonical(belief, model.space)
         found = doors.sensor(model, sensor)
         doors.point(f"z[{sensor!r}]", z, found.space)
+        doors.finite(f"z[{sensor!r}]", z)
         doors.same_dtype(belief.cov.dtype, **{f"z[{sensor!r}]": z})
         return _update(recipe, model, sensor, belief, z, c, mask)
 
     def step(belief: Gaussian, row: Log) -> tuple[Gaussian, dict[str, Info]]:
+        doors.tables("row", row, model)
         belief = predict(belief, row.u, row.dt)
         infos = {}
         for name in model.sensors:
@@ -180,10 +184,11 @@ def _predict(transform: Transform, model: Model, belief: Gaussian, u: PyTree, dt
     dt = jnp.where(dt > 0, dt, 1.0)
 
     def f(x: PyTree) -> PyTree:
-        return _image("f(x, u, dt)", model.f(x, u, dt), model.space, belief.cov.dtype)
+        y = doors.call("f(x, u, dt)", model.f, x=x, u=u, dt=dt)
+        return _image("f(x, u, dt)", y, model.space, belief.cov.dtype)
 
     m = transform(f, belief, model.space, model.space)
-    Q = model.Q(belief.mean, u, dt)
+    Q = doors.call("Q(x, u, dt)", model.Q, x=belief.mean, u=u, dt=dt)
     doors.noise("Q(x, u, dt)", Q, model.space.dim, belief.cov.dtype)
     return Gaussian(m.mean, linalg.symmetrize(m.cov + Q))
 
@@ -194,9 +199,10 @@ def _update(
     sensor, dtype = model.sensors[name], belief.cov.dtype
 
     def h(x: PyTree) -> PyTree:
-        return _image(f"h(x, c) of sensor {name!r}", sensor.h(x, c), sensor.space, dtype)
+        y = doors.call(f"h(x, c) of sensor {name!r}", sensor.h, x=x, c=c)
+        return _image(f"h(x, c) of sensor {name!r}", y, sensor.space, dtype)
 
-    R = sensor.R(belief.mean, c)
+    R = doors.call(f"R(x, c) of sensor {name!r}", sensor.R, x=belief.mean, c=c)
     doors.noise(f"R(x, c) of sensor {name!r}", R, sensor.space.dim, dtype)
     there = _mask(mask, sensor, name)
 
@@ -239,8 +245,7 @@ def _moved(space: Space, belief: Gaussian, delta: jax.Array, P: jax.Array) -> Ga
 def _mask(mask: Array | None, sensor: Sensor, name: str) -> jax.Array | None:
     if mask is None:
         return None
-    if np.shape(mask) != (sensor.space.dim,) or mask.dtype != bool:
-        raise ValueError(f"mask of {name!r}: expected bool of shape {(sensor.space.dim,)}, got {doors.describe(mask)}")
+    doors.mask(f"mask of {name!r}", mask, (sensor.space.dim,))
     return jnp.asarray(mask)
 
 
@@ -300,6 +305,8 @@ def _update_if_there(update: Callable, model: Model, belief: Gaussian, row: Log,
     if name not in row.valid:
         return update(belief, z, name, c)
     valid = row.valid[name]
+    doors.mask(f"row.valid[{name!r}]", valid, (), (model.sensors[name].space.dim,))
+    valid = np.bool_(valid) if isinstance(valid, bool) else valid
     mask = valid if np.ndim(valid) else None
     nothing = _nothing(model.sensors[name].space.dim, belief.cov.dtype)
     return _branch(valid.any(), lambda b: update(b, z, name, c, mask), lambda b: (b, nothing), belief)

@@ -218,11 +218,7 @@ def validate(model: Model, log: Log, dtype: Any = None) -> None:
     Raises:
         ValueError, TypeError, KeyError: naming the field, what was expected and what came.
     """
-    if not isinstance(log, Log):
-        raise TypeError(f"log: expected a Log, got {type(log).__name__}")
-    for field in ("z", "c", "valid"):
-        if not isinstance(getattr(log, field), Mapping):
-            raise TypeError(f"log.{field}: expected a dict by sensor, got {doors.describe(getattr(log, field))}")
+    doors.tables("log", log, model)
     doors.array("log.dt", log.dt)
     if log.dt.ndim != 1:
         raise ValueError(f"log.dt: expected shape (T,), got {log.dt.shape}")
@@ -236,19 +232,16 @@ def validate(model: Model, log: Log, dtype: Any = None) -> None:
         k = int(np.argmax(np.asarray(log.dt) < 0))
         raise ValueError(f"log.dt: expected intervals >= 0 s, got {np.asarray(log.dt)[k]} at row {k}")
     for name, z in log.z.items():
-        doors.point(f"log.z[{name!r}]", z, doors.sensor(model, name).space, leading=(length,))
-    for field, table in {"c": log.c, "valid": log.valid}.items():
-        for name in table:
-            if name not in log.z:
-                raise KeyError(f"log.{field}: expected sensors of log.z, {list(log.z)}, got {name!r}")
+        doors.point(f"log.z[{name!r}]", z, model.sensors[name].space, leading=(length,))
     for name, valid in log.valid.items():
         doors.mask(f"log.valid[{name!r}]", valid, (length,), (length, model.sensors[name].space.dim))
-    doors.floating("log.u", log.u)
-    named = {"log.u": log.u} | {f"log.{f}[{name!r}]": tree for f in "zc" for name, tree in getattr(log, f).items()}
-    for name, tree in named.items():
-        doors.finite(name, tree)
     dtype = jax.dtypes.canonicalize_dtype(log.dt.dtype if dtype is None else dtype)
-    doors.same_dtype(dtype, **{"log.dt": log.dt}, **named)
+    doors.same_dtype(dtype, **{"log.dt": log.dt})
+    doors.inputs("log.u", log.u, dtype)
+    for field, table in {"z": log.z, "c": log.c}.items():
+        for name, tree in table.items():
+            doors.finite(f"log.{field}[{name!r}]", tree)
+            doors.same_dtype(dtype, **{f"log.{field}[{name!r}]": tree})
 
 
 def stack(logs: Sequence[Log]) -> Log:
@@ -267,10 +260,10 @@ def stack(logs: Sequence[Log]) -> Log:
     masked = [name for name in logs[0].z if ragged or any(name in log.valid for log in logs)]
     full = [log._replace(valid={name: _explicit(logs, log, name) for name in masked}) for log in logs]
     for log in full[1:]:
-        if jax.tree.structure(log) != jax.tree.structure(full[0]):
-            raise ValueError(
-                f"logs: expected one structure, got {jax.tree.structure(full[0])} and {jax.tree.structure(log)}"
-            )
+        for field, a, b in zip(Log._fields, full[0], log, strict=True):
+            if jax.tree.structure(a) != jax.tree.structure(b):
+                found = f"{doors.describe(a)} and {doors.describe(b)}"
+                raise ValueError(f"logs: expected one structure of {field}, got {found}")
 
     return jax.tree.map(lambda *leaves: np.stack(leaves), *[_padded(log, length) for log in full])
 
@@ -318,7 +311,7 @@ def align(t: np.ndarray, truth: tuple[np.ndarray, PyTree], space: Space, gap: fl
     stamps = _seconds("t of truth", truth[0])
     doors.increasing("t of truth", stamps)
     if len(stamps) < 2:
-        raise ValueError(f"t of truth: expected at least two stamps, got {stamps}")
+        raise ValueError(f"t of truth: expected at least two stamps, got {len(stamps)}")
     points = jax.tree.map(np.asarray, truth[1])
     doors.point("truth", points, space, leading=stamps.shape)
     doors.finite("truth", points)

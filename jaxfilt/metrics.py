@@ -76,15 +76,15 @@ def nees(error: Array, cov: Array) -> jax.Array:
 
     Args:
         error: (..., n) from `errors`.
-        cov: (..., n, n) with the same leading axes, or (n, n) for all.
+        cov: (..., n, n) with the same leading axes.
 
     Returns:
         (...,); NaN where P is not positive definite.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> nees(jnp.array([[2.0, 3.0]]), jnp.diag(jnp.array([4.0, 9.0]))).tolist()
-        [2.0]
+        >>> float(nees(jnp.array([2.0, 3.0]), jnp.diag(jnp.array([4.0, 9.0]))))
+        2.0
     """
 
     def one(e: Array, P: Array) -> jax.Array:
@@ -270,7 +270,7 @@ def whiteness(info: Info, lags: int = 20, confidence: float = CONFIDENCE) -> Whi
     if np.ndim(info.nis) != 1:
         raise ValueError(f"info: expected leading axis T, one run, got {doors.describe(info.nis)} for nis")
     keep = np.asarray(used(info)[1]) > 0
-    e = np.asarray(jax.vmap(_normalised)(jnp.asarray(info.innovation), jnp.asarray(info.S)), np.float64)[keep]
+    e = np.asarray(_normalised(info.innovation, info.S), np.float64)[keep]
     dof = np.asarray(info.dof)[keep]
     rho, pairs = [], []
     for lag in range(1, min(lags, len(e) - 1) + 1):
@@ -281,5 +281,7 @@ def whiteness(info: Info, lags: int = 20, confidence: float = CONFIDENCE) -> Whi
     return Whiteness(np.arange(1, len(rho) + 1), np.array(rho), bound)
 
 
+@jax.jit
+@jax.vmap
 def _normalised(r: Array, S: Array) -> jax.Array:
     return linalg.forward_solve(linalg.cholesky(S), r)

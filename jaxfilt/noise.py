@@ -60,6 +60,8 @@ def van_loan(A: Array, density: Array) -> Callable[[PyTree, PyTree, Array], Arra
     Source: C. F. Van Loan, Computing integrals involving the matrix exponential (1978), eq. 1.2.
     """
     n = A.shape[0]
+    if A.shape != (n, n):
+        raise ValueError(f"van_loan(A): expected a square matrix, got shape {A.shape}")
     doors.covariance("van_loan(density)", density, n)
 
     def Q(x: PyTree, u: PyTree, dt: Array) -> Array:
@@ -129,6 +131,8 @@ def log_cholesky(n: int) -> Parametrisation:
     def theta(cov: Array) -> Array:
         doors.covariance("cov", cov, n)
         elements = linalg.cholesky(jnp.asarray(cov))[rows, columns]
+        if doors.is_concrete(elements) and np.isnan(elements).any():
+            raise ValueError("cov: expected a positive definite matrix, got a singular one")
         return jnp.where(on_diagonal, jnp.log(jnp.where(on_diagonal, elements, 1.0)), elements)
 
     return Parametrisation(cov, theta)
@@ -147,6 +151,8 @@ def blocks(*parts: tuple[Parametrisation, int]) -> Parametrisation:
     starts = [end - dim for end, (_, dim) in zip(ends, parts, strict=True)]
 
     def cov(theta: tuple) -> Array:
+        if len(theta) != len(parts):
+            raise ValueError(f"theta: expected a tuple of {len(parts)}, one for each block, got {len(theta)}")
         return jax.scipy.linalg.block_diag(*[p.cov(t) for (p, _), t in zip(parts, theta, strict=True)])
 
     def theta(cov: Array) -> tuple:

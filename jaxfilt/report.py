@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 import json
 import math
 import platform
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,7 +132,7 @@ def _frame(kind: str, name: str, settings: dict, compiling: float, running: floa
             "jaxfilt": version("jaxfilt"),
             "jax": jax.__version__,
             "numpy": np.__version__,
-            "python": platform.pythonversion(),
+            "python": platform.python_version(),
             "device": str(jax.devices()[0].device_kind),
         },
         "settings": settings,
@@ -266,8 +268,10 @@ def _study_figure(s: Study, name: str) -> Figure:
     return fig
 
 
-def _styles() -> list[dict[str, Any]]:
-    return [{"color": c, "linestyle": d, "linewidth": 1.3} for c, d in zip(COLOURS, DASHES, strict=True)]
+def _styles(width: float = 1.3) -> Iterator[dict[str, Any]]:
+    """A colour and a dash for each filter in turn; after the last they begin again."""
+    lines = [{"color": c, "linestyle": d, "linewidth": width} for c, d in zip(COLOURS, DASHES, strict=True)]
+    return itertools.cycle(lines)
 
 
 def _component(blocks: Blocks, block: str, k: int) -> str:
@@ -286,36 +290,40 @@ def _legend(fig: Figure, filters: list[str]) -> None:
     fig.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
 
 
+def _finite(series: list[np.ndarray]) -> np.ndarray:
+    values = np.concatenate([np.ravel(a) for a in series])
+    return values[np.isfinite(values)]
+
+
 def _logarithmic(axes: Axes, series: list[np.ndarray]) -> None:
     """A logarithmic axis where a linear one would show one filter only, or only the start."""
-    values = np.concatenate([np.ravel(a) for a in series])
-    values = values[np.isfinite(values) & (values > 0)]
-    if len(values) and values.max() > 30 * np.median(values):
+    values = _finite(series)
+    if len(values) and values.min() > 0 and values.max() > 30 * np.median(values):
         axes.set_yscale("log")
-    elif len(values):
+    else:
         axes.set_ylim(bottom=0)
 
 
 def _draw_error(axes: Axes, t: np.ndarray, errors: list[np.ndarray], stds: list[np.ndarray]) -> None:
-    """Errors within the bands of three standard deviations that their filters claim."""
+    """Errors within the bands of three standard deviations that their filters claim; the start may stick out."""
     for style, std in zip(_styles(), stds, strict=False):
         axes.fill_between(t, -3 * std, 3 * std, color=style["color"], alpha=0.15, linewidth=0)
-    for style, error in zip(_styles(), errors, strict=False):
-        axes.plot(t, error, **(style | {"linewidth": 0.9}))
-    reach = [np.nanquantile(3 * std, 0.95) for std in stds] + [np.nanquantile(np.abs(e), 0.99) for e in errors]
-    reach = 1.3 * max(r for r in reach if np.isfinite(r))
-    axes.set_ylim(-reach, reach)
+    for style, error in zip(_styles(0.9), errors, strict=False):
+        axes.plot(t, error, **style)
+    values = [(3 * _finite(stds), 0.95), (np.abs(_finite(errors)) if errors else np.zeros(0), 0.99)]
+    reach = max((float(np.quantile(v, share)) for v, share in values if len(v)), default=0.0)
+    if reach > 0:
+        axes.set_ylim(-1.3 * reach, 1.3 * reach)
 
 
 def _draw_consistency(axes: Axes, t: np.ndarray, scores: list[Consistency]) -> None:
     there = np.isfinite(scores[0].low)
     axes.fill_between(t[there], scores[0].low[there], scores[0].high[there], **BAND)
     axes.plot(t[there], scores[0].expected[there], **EXPECTED)
-    for style, score in zip(_styles(), scores, strict=False):
+    for style, score in zip(_styles(0.9), scores, strict=False):
         seen = np.isfinite(score.mean)
-        axes.plot(t[seen], score.mean[seen], **(style | {"linewidth": 0.9}))
-    values = np.concatenate([score.mean for score in scores])
-    values = values[np.isfinite(values)]
+        axes.plot(t[seen], score.mean[seen], **style)
+    values = _finite([score.mean for score in scores])
     if len(values) and values.max() > 5 * np.median(scores[0].high[there]):
         axes.set_yscale("log")
 
@@ -350,21 +358,22 @@ def _draw_track(
     if real is not None and mask is not None:
         real = np.where(mask[:, None], real, np.nan)
     seen = {filt: (_coordinates(space, mean), std) for filt, (mean, std) in estimates.items()}
+    i = index[0]
     if len(index) > 1:
-        i, j = index[:2]
+        j = index[1]
         if real is not None:
             axes.plot(real[:, i], real[:, j], color="0.6", linewidth=3, solid_capstyle="round")
         for style, (x, _) in zip(_styles(), seen.values(), strict=False):
             axes.plot(x[:, i], x[:, j], **style)
-        track = next(iter(seen.values()))[0] if real is None else real[np.isfinite(real).all(1)]
-        start = float(track[0, i]), float(track[0, j])
-        axes.plot(start[0], start[1], "o", color="0.2", markersize=6)
-        axes.annotate("start", start, (8, -12), textcoords="offset points")
+        way = next(iter(seen.values()))[0] if real is None else real
+        way = way[np.isfinite(way).all(1)]
+        if len(way):
+            axes.plot(way[0, i], way[0, j], "o", color="0.2", markersize=6)
+            axes.annotate("start", (way[0, i], way[0, j]), (8, -12), textcoords="offset points")
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel(_with_unit(f"{name}[0]", unit))
         axes.set_ylabel(_with_unit(f"{name}[1]", unit))
         return
-    i = index[0]
     if real is not None:
         axes.plot(t, real[:, i], color="0.6", linewidth=3)
     for style, (x, std) in zip(_styles(), seen.values(), strict=False):
@@ -409,6 +418,7 @@ def _replay_figure(r: Replayed, name: str) -> Figure:
         axes.axhline(0, **EXPECTED)
         axes.set_ylabel(f"whiteness {sensor}")
         axes.set_xlabel("lag (readings)")
+        axes.locator_params(axis="x", integer=True)
     checks[0].set_title(f"innovations, with {100 * r.confidence:g} % bounds", fontsize="medium")
     _legend(fig, list(reviews))
     return fig

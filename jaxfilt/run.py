@@ -39,6 +39,7 @@ def scan(filter: Filter, belief: Gaussian, log: Log, store: Callable[[Any, dict[
         >>> track.belief.mean.shape, track.info["z"].nis.shape
         ((3, 1), (3,))
     """
+    doors.instance("filter", filter, Filter)
     doors.belief("belief", belief, filter.model.space)
     logs.validate(filter.model, log, belief.cov.dtype)
     dtype = jax.dtypes.canonicalize_dtype(belief.cov.dtype)

@@ -49,4 +49,4 @@ def scenario(name: str) -> Scenario:
 
 def about(name: str) -> str:
     """What happens in the scenario of this name, in a line."""
-    return (SCENARIOS[name].__doc__ or "").strip().splitlines()[0]
+    return (SCENARIOS[name].__doc__ or "").strip().splitlines()[0].replace("``", "")

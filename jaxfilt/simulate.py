@@ -44,6 +44,7 @@ def simulate(
         ((5, 1), (5, 1))
     """
     doors.belief("belief", belief, model.space)
+    doors.tables("log", log, model)
     dtype = jax.dtypes.canonicalize_dtype(belief.cov.dtype)
     belief, log = jax.tree.map(jnp.asarray, (belief, log))
     belief = jax.tree.map(lambda a: a.astype(dtype), belief)
@@ -75,10 +76,12 @@ def _perturbed(x: PyTree, cov: Array, space: Space, key: Array) -> PyTree:
 
 def _moved(model: Model, x: PyTree, u: PyTree, dt: Array, key: Array) -> PyTree:
     dt = jnp.where(dt > 0, dt, 1.0)
-    moved = _perturbed(model.f(x, u, dt), model.Q(x, u, dt), model.space, key)
+    image = doors.call("f(x, u, dt)", model.f, x=x, u=u, dt=dt)
+    moved = _perturbed(image, model.Q(x, u, dt), model.space, key)
     return jax.tree.map(lambda a, like: a.astype(like.dtype), moved, x)
 
 
 def _reading(model: Model, name: str, x: PyTree, row: Log, key: Array) -> PyTree:
     sensor, c = model.sensors[name], row.c.get(name, ())
-    return _perturbed(sensor.h(x, c), sensor.R(x, c), sensor.space, key)
+    image = doors.call(f"h(x, c) of sensor {name!r}", sensor.h, x=x, c=c)
+    return _perturbed(image, sensor.R(x, c), sensor.space, key)

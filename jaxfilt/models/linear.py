@@ -38,11 +38,14 @@ def linear(
         >>> model.space.dim, list(model.sensors)
         (2, ['z'])
     """
+    doors.matrix("A", A)
     n = A.shape[-1]
     if A.shape != (n, n):
         raise ValueError(f"A: expected a square matrix, got shape {A.shape}")
-    if B is not None and (B.ndim != 2 or B.shape[0] != n):
-        raise ValueError(f"B: expected shape ({n}, k), got {B.shape}")
+    if B is not None:
+        doors.matrix("B", B)
+        if B.shape[0] != n:
+            raise ValueError(f"B: expected shape ({n}, k), got {B.shape}")
     Hs = dict(H) if isinstance(H, Mapping) else {"z": H}
     Rs = dict(R) if isinstance(R, Mapping) else {"z": R}
     if list(Hs) != list(Rs):
@@ -50,7 +53,8 @@ def linear(
     doors.covariance("Q", Q, n)
     sensors = {}
     for name, M in Hs.items():
-        if M.ndim != 2 or M.shape[1] != n:
+        doors.matrix(f"H of sensor {name!r}", M)
+        if M.shape[1] != n:
             raise ValueError(f"H of sensor {name!r}: expected shape (m, {n}), got {M.shape}")
         doors.covariance(f"R of sensor {name!r}", Rs[name], M.shape[0])
         sensors[name] = Sensor(lambda x, c, M=M: M @ x, const(Rs[name]), vector(M.shape[0]))
