@@ -321,7 +321,7 @@ def align(t: np.ndarray, truth: tuple[np.ndarray, PyTree], space: Space, gap: fl
     share = np.clip((t - stamps[after - 1]) / width, 0.0, 1.0)
     dtype = jax.dtypes.canonicalize_dtype(float)
     a, b = (jax.tree.map(lambda x, i=i: x[i].astype(dtype), points) for i in (after - 1, after))
-    between = jax.vmap(lambda a, b, s: space.plus(a, s * space.minus(b, a)))
+    between = jax.jit(jax.vmap(lambda a, b, s: space.plus(a, s * space.minus(b, a))))
     inside = (t >= stamps[0]) & (t <= stamps[-1])
     known = (width <= gap) | (share == 0) | (share == 1)
     return Truth(jax.tree.map(np.asarray, between(a, b, share.astype(dtype))), inside & known)

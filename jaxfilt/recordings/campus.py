@@ -42,7 +42,8 @@ class Wheels(NamedTuple):
 
 # The deviation and the scale: least squares against the truth of the calibration runs, 2013-01-10 and 2013-02-23. The
 # noises: rounded geometric means of the 20 best of 200 drawn at random, by position RMSE on the same two runs. No
-# number was chosen on 2013-04-05, the test; that the compass deviates alike on all runs was seen on all three.
+# number was chosen on 2013-04-05, the test, but its scores were in sight; that the compass deviates alike on all runs
+# was seen on all three.
 CAMPUS = {
     "deviation": (0.128, -0.051, 0.070, 0.025, 0.095),  # rad, no logarithms: 1, cos, sin, cos 2, sin 2 of the heading
     "walk": math.log(0.07),  # m/sqrt(s)
