@@ -153,11 +153,10 @@ def replay(
     if names:
         _list({name: ", ".join(datasets.sequences(name)) for name in recordings.names()}, "recordings")
         return
-    makers = _makers(filters)
+    makers, threshold = _makers(filters), _gate(gate, recording)
     _set_dtype(dtype)
     chosen, source, label = _replay(recording, log, sequence)
     folder = _writable(out or f"jaxfilt-out/replay-{label}")
-    threshold = _gate(gate, recording)
     bank = {name: functools.partial(_built, make, chosen.model, gate=threshold) for name, make in makers.items()}
     with _explained(source), _progress():
         result = replayed(chosen, bank)

@@ -138,36 +138,44 @@ def anees(values: Array, dim: int, confidence: float = CONFIDENCE) -> Consistenc
     return mean_of_squares(np.where(finite, values, 0.0).sum(0), dim * count, count, confidence)
 
 
-def anees_total(run_means: Array, dim: int, confidence: float = CONFIDENCE) -> Consistency:
-    """Average NEES over runs *and* time: the mean of the runs' own time averages.
+def anees_total(run_means: Array, run_squares: Array, dim: int, confidence: float = CONFIDENCE) -> Consistency:
+    """Average NEES over runs *and* time, with bounds that know that the NEES of one run is correlated in time.
 
-    The NEES of one run is correlated in time, so the chi-square bound with N T n degrees of freedom would be far too
-    narrow. The runs are independent of one another: the bounds are Student's, from the spread of their averages.
+    N runs of T steps are not worth N T independent NEES, but ``N V / B``: V is the variance of all of them, B that of
+    the runs' own averages, so V / B lies between 1 (a run is as good as one step) and T. The bounds are chi-square's
+    for so many; a factor (normal over Student's quantile)^2 allows for B being known from N runs only.
 
     Args:
-        run_means: (runs,) each run's average over time; what is not finite does not count.
+        run_means, run_squares: (runs,) each run's average over time of its NEES and of its NEES squared; what is not
+            finite does not count.
         dim: n.
         confidence: probability of the two-sided bounds.
 
     Returns:
         Consistency with numbers; bounds NaN with fewer than two runs.
 
-    Example:
+    Example: 100 runs whose NEES does not change over time.
         >>> import numpy as np
-        >>> total = anees_total(np.array([1.8, 2.1, 2.0, 2.3]), dim=2, confidence=0.95)
-        >>> [round(float(x), 2) for x in total]
-        [2.05, 2.0, 1.67, 2.33]
+        >>> values = np.random.default_rng(0).chisquare(2, 100)
+        >>> [round(float(x), 2) for x in anees_total(values, values**2, dim=2, confidence=0.95)]
+        [2.36, 2.0, 1.62, 2.42]
     """
-    from scipy.special import stdtrit  # scipy comes with jax; imported where it is used, to keep `import jaxfilt` quick
+    from scipy.special import ndtri, stdtrit  # scipy comes with jax; imported where it is used, as in chisquare
 
-    run_means = np.asarray(run_means, np.float64)
-    run_means = run_means[np.isfinite(run_means)]
-    runs = len(run_means)
-    half = np.nan
-    if runs > 1:
-        half = float(stdtrit(runs - 1, 0.5 + 0.5 * confidence)) * run_means.std(ddof=1) / np.sqrt(runs)
-    mean = float(run_means.mean()) if runs else np.nan
-    return Consistency(mean, float(dim), float(dim - half), float(dim + half))
+    run_means, run_squares = np.asarray(run_means, np.float64), np.asarray(run_squares, np.float64)
+    finite = np.isfinite(run_means) & np.isfinite(run_squares)
+    runs = int(finite.sum())
+    if runs == 0:
+        return Consistency(np.nan, float(dim), np.nan, np.nan)
+    mean = float(run_means[finite].mean())
+    if runs == 1:
+        return Consistency(mean, float(dim), np.nan, np.nan)
+    all_of_them, of_averages = run_squares[finite].mean() - mean**2, run_means[finite].var(ddof=1)
+    tail = 0.5 + 0.5 * confidence
+    steps_worth = max(1.0, all_of_them / of_averages) if of_averages > 0 else 1.0
+    worth = runs * steps_worth * float(ndtri(tail) / stdtrit(runs - 1, tail)) ** 2
+    low, high = chisquare.bounds(confidence, np.asarray(dim * worth))
+    return Consistency(mean, float(dim), float(low / worth), float(high / worth))
 
 
 def used(info: Info) -> tuple[jax.Array, jax.Array]:

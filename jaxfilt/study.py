@@ -102,6 +102,7 @@ class _PerRun(NamedTuple):
     """What is kept of each run; ``fault`` indexes (step, sensor) row by row, -1 if none, and ``status`` is its code."""
 
     nees_mean: Array
+    nees_square: Array
     nees_last: Array
     sound: Array
     fault: Array
@@ -373,12 +374,18 @@ def _sound(error: Array, belief: Gaussian) -> Array:
 
 def _kept(nees: Array, sound: Array, statuses: Array) -> _PerRun:
     normal = jnp.isfinite(nees)
-    mean = jnp.where(normal, nees, 0.0).sum() / normal.sum().astype(nees.dtype)
+    count, values = normal.sum().astype(nees.dtype), jnp.where(normal, nees, 0.0)
     codes = statuses.reshape(-1)
     bad = codes >= Status.BAD_BELIEF
     first = jnp.argmax(bad)
-    fault = jnp.where(jnp.any(bad), first, -1)
-    return _PerRun(mean, nees[-1], jnp.all(sound) & ~jnp.any(bad), fault, codes[first])
+    return _PerRun(
+        nees_mean=values.sum() / count,
+        nees_square=(values * values).sum() / count,
+        nees_last=nees[-1],
+        sound=jnp.all(sound) & ~jnp.any(bad),
+        fault=jnp.where(jnp.any(bad), first, -1),
+        status=codes[first],
+    )
 
 
 def _scores(
@@ -397,7 +404,7 @@ def _scores(
         rmse={name: np.sqrt(square[:, list(index)].sum(1)) for name, (index, _) in blocks.items()},
         rmse_total={name: float(np.sqrt(square_total[list(index)].sum())) for name, (index, _) in blocks.items()},
         nees=metrics.mean_of_squares(sums.nees, dim * sums.nees_count, sums.nees_count, confidence),
-        nees_total=metrics.anees_total(each.nees_mean, dim, confidence),
+        nees_total=metrics.anees_total(each.nees_mean, each.nees_square, dim, confidence),
         nis=nis,
         nis_total=nis_total,
         diverged=metrics.diverged(each.nees_last, each.sound, dim),
@@ -531,7 +538,7 @@ def _one(replay: Replay, filters: Filters, theta: PyTree, log: Log, known: PyTre
 
 
 def _review(seen: tuple, truth: Truth | None, blocks: Blocks, dim: int, lags: int, confidence: float) -> Review:
-    mean, std, info, sound, error, nees = seen
+    state, std, info, sound, error, nees = seen
     statuses = np.stack([i.status for i in info.values()], 1)
     bad = np.argwhere(statuses >= Status.BAD_BELIEF)
     fault = None
@@ -543,10 +550,10 @@ def _review(seen: tuple, truth: Truth | None, blocks: Blocks, dim: int, lags: in
         error = np.where(truth.mask[:, None], error, np.nan)
         nees = np.where(truth.mask, nees, np.nan)
         normal = nees[np.isfinite(nees)]
-        scores = metrics.anees_total([normal.mean()] if len(normal) else [], dim, confidence)
-        last = normal[-1] if len(normal) else np.nan
+        mean, last = (float(normal.mean()), normal[-1]) if len(normal) else (np.nan, np.nan)
+        scores = Consistency(mean, float(dim), np.nan, np.nan)
     return Review(
-        mean,
+        state,
         std,
         info,
         error,

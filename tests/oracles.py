@@ -81,7 +81,7 @@ def no_carry(d: np.ndarray) -> np.ndarray:
 
 def log_density(r: np.ndarray, S: np.ndarray) -> float:
     """log N(r; 0, S)."""
-    return float(multivariate_normal.logpdf(r, np.zeros(len(r)), S))
+    return float(multivariate_normal.logpdf(r, cov=S))  # pyright: ignore[reportArgumentType]
 
 
 def ekf_predict(book: Book, x: Point, P: np.ndarray, u: np.ndarray, dt: float) -> tuple:
@@ -107,15 +107,15 @@ def iekf_correct(iterations: int) -> Callable:
         R = sensor.R(x, c)[np.ix_(seen, seen)]
         H = sensor.H(x, c)[seen]
         loglik = log_density(sensor.minus(z, sensor.h(x, c))[seen], H @ P @ H.T + R)
-        d = np.zeros(len(P))
+        d, cov = np.zeros(len(P)), P
         for _ in range(iterations):
             at = book.plus(x, d)
             H = sensor.H(at, c)[seen] @ book.carry(d)
             r = sensor.minus(z, sensor.h(at, c))[seen]
-            information = np.linalg.inv(P) + H.T @ np.linalg.solve(R, H)
-            d = np.linalg.solve(information, H.T @ np.linalg.solve(R, r + H @ d))
+            cov = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.solve(R, H))
+            d = cov @ H.T @ np.linalg.solve(R, r + H @ d)
         G = book.carry(d)
-        return book.plus(x, d), G @ np.linalg.inv(information) @ G.T, loglik
+        return book.plus(x, d), G @ cov @ G.T, loglik
 
     return correct
 

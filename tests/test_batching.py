@@ -82,7 +82,7 @@ def test_a_batch_may_start_from_many_beliefs_and_is_a_plain_vmap():
     wider = np.linspace(1.0, 3.0, RUNS)
     beliefs = jf.Gaussian(wider[:, None] * s.belief.mean, wider[:, None, None] * s.belief.cov)
     run = scan("linear", "kf")
-    plain = jax.vmap(run, in_axes=(None, 0, jf.Log(None, None, 0, None, None)))(s.theta, beliefs, batch)
+    plain = jax.vmap(lambda b, z: run(s.theta, b, batch._replace(z=z)))(beliefs, batch.z)
     same(scan_runs("linear", "kf", ("z",))(s.theta, beliefs, batch), plain)
     for k in range(RUNS):
         row = lambda a, k=k: a[k]  # noqa: E731
@@ -133,7 +133,7 @@ def batched_matrices(body):
 
 
 def branches(body):
-    """How many branches on the schedule: those that return a belief. (JAX's own choice of platform returns an array.)"""
+    """How many branches on the schedule: those that return a belief. (JAX's choice of platform returns an array.)"""
     return sum(e.primitive.name == "cond" and len(e.outvars) > 1 for e in body)
 
 
@@ -215,7 +215,8 @@ def test_f_is_traced_once_for_a_scan_whatever_its_length():
 
     sensor = jf.Sensor(lambda x, c: x, jf.const(jnp.eye(1)), jf.vector(1))
     model = jf.Model(f, jf.const(jnp.eye(1)), jf.vector(1), {"z": sensor})
-    run = jax.jit(lambda z: jf.scan(jf.ekf(model), jf.Gaussian(jnp.zeros(1), jnp.eye(1)), jf.Log(jnp.ones(9), (), {"z": z}, {}, {})))
+    belief, log = jf.Gaussian(jnp.zeros(1), jnp.eye(1)), jf.Log(jnp.ones(9), (), {}, {}, {})
+    run = jax.jit(lambda z: jf.scan(jf.ekf(model), belief, log._replace(z={"z": z})))
     run(jnp.ones((9, 1)))
     first = len(calls)
     run(jnp.zeros((9, 1)))

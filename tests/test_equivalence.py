@@ -1,6 +1,7 @@
 """Every filter against the book's own loop, against other libraries, and against one big conditioning."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ def tracked(name, filter, *without):
         valid={n: v for n, v in s.log.valid.items() if n not in without},
     )
     track = jax.jit(lambda theta, b, log: jf.scan(FILTERS[filter](s.model(theta)), b, log))(s.theta, s.belief, log)
-    logliks = sum(np.asarray(info.loglik) for info in track.info.values())
+    logliks = np.sum([info.loglik for info in track.info.values()], axis=0)
     return s.flat(track.belief.mean), np.asarray(track.belief.cov), logliks, log
 
 
@@ -105,7 +106,7 @@ def test_equals_filterpy_kalman(whole):
     from filterpy.kalman import KalmanFilter
 
     s, Q, R, z, track = whole
-    theirs = KalmanFilter(dim_x=3, dim_z=2, dim_u=2)
+    theirs: Any = KalmanFilter(dim_x=3, dim_z=2, dim_u=2)
     theirs.x, theirs.P, theirs.Q, theirs.R = s.start.copy(), s.belief.cov.copy(), Q, R
     theirs.F, theirs.B, theirs.H = A, B, H["wide"]
     for k in range(len(z)):
@@ -124,7 +125,7 @@ def test_equals_filterpy_extended_on_the_car_with_landmarks():
     means, covs, _, log = tracked("car", "ekf", "gnss")
     book = s.book(s.theta)
     mark = book.sensors["mark"]
-    theirs = ExtendedKalmanFilter(dim_x=4, dim_z=2)
+    theirs: Any = ExtendedKalmanFilter(dim_x=4, dim_z=2)
     theirs.x, theirs.P, theirs.R = s.start.copy(), s.belief.cov.copy(), mark.R(None, None)
     for k, row in enumerate(oracles.rows_of(log, book)):
         if row.dt > 0:
@@ -144,7 +145,7 @@ def test_equals_filterpy_unscented_with_fresh_points(whole):
 
     s, Q, R, z, track = whole
     points = MerweScaledSigmaPoints(3, alpha=0.5, beta=2.0, kappa=0.0)
-    theirs = UnscentedKalmanFilter(3, 2, 1.0, lambda x: H["wide"] @ x, lambda x, dt, u: A @ x + B @ u, points)
+    theirs: Any = UnscentedKalmanFilter(3, 2, 1.0, lambda x: H["wide"] @ x, lambda x, dt, u: A @ x + B @ u, points)
     theirs.x, theirs.P, theirs.Q, theirs.R = s.start.copy(), s.belief.cov.copy(), Q, R
     for k in range(len(z)):
         theirs.predict(u=s.log.u[k])
@@ -160,14 +161,14 @@ def test_equals_statsmodels(whole):
 
     s, Q, R, z, track = whole
     u = s.log.u
-    theirs = KalmanFilter(k_endog=2, k_states=3, k_posdef=3, tolerance=0)
+    theirs: Any = KalmanFilter(k_endog=2, k_states=3, k_posdef=3, tolerance=0)
     theirs.bind(z.copy())
     theirs["design"], theirs["obs_cov"], theirs["transition"] = H["wide"], R, A
     theirs["selection"], theirs["state_cov"] = np.eye(3), Q
     theirs.state_intercept = np.ascontiguousarray(np.vstack([u[1:] @ B.T, np.zeros(3)]).T)
     theirs.initialize_known(A @ s.start + B @ u[0], A @ s.belief.cov @ A.T + Q)
     theirs.loglikelihood_burn = 0
-    result = theirs.filter()
+    result: Any = theirs.filter()
     np.testing.assert_allclose(track["kf"].belief.mean, result.filtered_state.T, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(
         track["kf"].belief.cov, result.filtered_state_cov.transpose(2, 0, 1), rtol=1e-9, atol=1e-12

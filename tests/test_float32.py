@@ -64,7 +64,9 @@ def test_scale_is_free(name, factory):
     means = s.flat(whole.belief.mean)
     assert np.abs(means - s.flat(tiny.belief.mean)).max() < 1e-4 * np.abs(means).max()
     size = np.sqrt(np.einsum("tii->ti", whole.belief.cov))
-    off = (1e12 * np.asarray(tiny.belief.cov, float) - np.asarray(whole.belief.cov)) / (size[:, :, None] * size[:, None, :])
+    off = (1e12 * np.asarray(tiny.belief.cov, float) - np.asarray(whole.belief.cov)) / (
+        size[:, :, None] * size[:, None, :]
+    )
     assert np.abs(off).max() < 1e-3
 
 

@@ -80,7 +80,9 @@ def test_equal_central_differences(case):
     scale, step = np.abs(gradient).max(), 1e-5
     assert scale > 1e-2
     for i in range(len(x)):
-        at = [value_and_grad(unflatten(parameters, x + h * np.eye(len(x))[i]), s.belief, s.log)[0] for h in (step, -step)]
+        at = [
+            value_and_grad(unflatten(parameters, x + h * np.eye(len(x))[i]), s.belief, s.log)[0] for h in (step, -step)
+        ]
         # A value of size V carries rounding V eps, which the difference divides by the step.
         rounding = 100 * np.finfo(float).eps * abs(at[0]) / step
         np.testing.assert_allclose(gradient[i], (at[0] - at[1]) / (2 * step), rtol=1e-6, atol=1e-7 * scale + rounding)
@@ -179,7 +181,7 @@ def test_finite_at_special_points(case, point):
 
 
 def test_finite_and_the_same_where_vmap_turns_branches_into_selects():
-    """Batched dt and valid: rows of no time and silent sensors are then computed and thrown away, gradients too."""
+    """Over a batch with its own dt and valid, as in tuning: what is not taken is then computed and thrown away."""
     s, parameters, value_and_grad, _ = compiled("car ukf")
     rng = np.random.default_rng(4)
 
@@ -192,10 +194,35 @@ def test_finite_and_the_same_where_vmap_turns_branches_into_selects():
 
     logs = [another(s.log) for _ in range(3)]
     batch = jax.tree.map(lambda *a: np.stack(a), *logs)
-    values, gradients = jax.jit(jax.vmap(value_and_grad, in_axes=(None, None, 0)))(parameters, s.belief, batch)
-    for k, log in enumerate(logs):
-        value, gradient = value_and_grad(parameters, s.belief, log)
-        np.testing.assert_allclose(values[k], value, rtol=1e-11)
-        got, want = numbers(jax.tree.map(lambda a, k=k: a[k], gradients)), numbers(gradient)
-        assert np.all(np.isfinite(got))
-        np.testing.assert_allclose(got, want, rtol=1e-8, atol=1e-9 * np.abs(want).max())
+
+    @jax.jit
+    @jax.value_and_grad
+    def total(parameters):
+        return jax.vmap(lambda log: loss(s, CASES["car ukf"][1], parameters, s.belief, log))(batch).sum()
+
+    value, gradient = total(parameters)
+    singles = [value_and_grad(parameters, s.belief, log) for log in logs]
+    np.testing.assert_allclose(value, sum(v for v, _ in singles), rtol=1e-11)
+    got, want = numbers(gradient), sum(numbers(g) for _, g in singles)
+    assert np.all(np.isfinite(got))
+    np.testing.assert_allclose(got, want, rtol=1e-8, atol=1e-9 * np.abs(want).max())
+
+
+def test_a_model_is_never_asked_what_happens_in_no_time():
+    """Where vmap computes both branches, f and Q that divide by dt would poison the gradients of rows with dt = 0."""
+    sensor = jf.Sensor(lambda x, c: x, jf.const(jnp.eye(1)), jf.vector(1))
+
+    def loglik(q, dt):
+        def f(x, u, dt):
+            return x + jnp.sqrt(dt) * jnp.log(dt)
+
+        model = jf.Model(f, lambda x, u, dt: q / dt * jnp.eye(1), jf.vector(1), {"z": sensor})
+        log = jf.Log(dt, (), {"z": jnp.ones((3, 1))}, {}, {})
+        return jf.log_likelihood(jf.ekf(model), jf.Gaussian(jnp.zeros(1), jnp.eye(1)), log)
+
+    dts = np.array([[0.5, 0.0, 0.2], [0.0, 0.0, 0.1]])
+    total = jax.jit(lambda q, dts: jax.vmap(loglik, in_axes=(None, 0))(q, dts).sum())
+    slope, slopes = jax.jit(jax.grad(total, argnums=(0, 1)))(2.0, dts)
+    assert np.all(np.isfinite(slopes))
+    np.testing.assert_array_equal(np.asarray(slopes)[dts == 0], 0.0)
+    np.testing.assert_allclose(slope, (total(2.0 + 1e-6, dts) - total(2.0 - 1e-6, dts)) / 2e-6, rtol=1e-6)

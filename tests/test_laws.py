@@ -8,7 +8,7 @@ import numpy as np
 import oracles
 import pytest
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 from systems import CAR, SYSTEMS, Car, car_model, correlation, scaled
 
 import jaxfilt as jf
@@ -157,6 +157,39 @@ def test_the_caller_chooses_what_is_stored(car):
     np.testing.assert_array_equal(got["dof"], s.log.valid["gnss"].sum(axis=1))
 
 
+def test_the_innovations_of_simulated_runs_are_white_and_of_the_size_that_they_claim():
+    """Each NIS is chi-square with the number of components seen, and no innovation foretells the next."""
+    s = system("linear")
+    names, runs = ["wide", "arm"], 300
+
+    def one(key, factor):
+        model = s.model(s.theta)
+        _, log = jf.simulate(model, s.belief, jax.tree.map(jnp.asarray, s.log), key)
+        wrong = model._replace(Q=lambda x, u, dt: factor * model.Q(x, u, dt))
+        return jf.scan(jf.kf(wrong), s.belief, log, store=lambda b, info: info)
+
+    many = jax.jit(jax.vmap(one, in_axes=(0, None)))
+    keys = jax.random.split(jax.random.key(1), runs)
+    right, wrong = many(keys, 1.0), many(keys, 0.25)
+
+    def chances(info):
+        """Of each reading's NIS being at least this large: uniform, if the filter is right."""
+        nis, dof = (np.concatenate([np.ravel(getattr(info[n], field)) for n in names]) for field in ("nis", "dof"))
+        return chi2.sf(nis[dof > 0], dof[dof > 0])
+
+    def correlation_with_the_next(info):
+        whole = np.asarray(info["wide"].dof)[0] == 2
+        r = np.asarray(info["wide"].innovation)[:, whole]
+        white = np.linalg.solve(np.linalg.cholesky(np.asarray(info["wide"].S)[:, whole]), r[..., None])[..., 0]
+        return np.mean(white[:, 1:] * white[:, :-1]) * np.sqrt(white[:, 1:].size)
+
+    assert len(chances(right)) > 10_000
+    assert kstest(chances(right), "uniform").pvalue > 1e-3
+    assert kstest(chances(wrong), "uniform").pvalue < 1e-12
+    assert abs(correlation_with_the_next(right)) < 3.3  # a standard normal number
+    assert abs(correlation_with_the_next(wrong)) > 5
+
+
 # --- gates -------------------------------------------------------------------------------------------------------
 
 
@@ -232,7 +265,10 @@ def test_matrices_may_come_with_the_row():
     noise = correlation(2, 7)
     sensor = jf.Sensor(lambda x, c: c["H"] @ x, lambda x, c: jnp.diag(c["std"] ** 2), jf.vector(1))
     model = jf.Model(
-        lambda x, u, dt: u["A"] @ x, lambda x, u, dt: u["A"] @ jnp.asarray(noise) @ u["A"].T, jf.vector(2), {"z": sensor}
+        lambda x, u, dt: u["A"] @ x,
+        lambda x, u, dt: u["A"] @ jnp.asarray(noise) @ u["A"].T,
+        jf.vector(2),
+        {"z": sensor},
     )
     log = jf.Log(np.ones(steps), {"A": As}, {"z": z}, {"z": {"H": Hs, "std": stds}}, {})
     track = jf.scan(jf.kf(model), jf.Gaussian(np.ones(2), 2 * noise), log)

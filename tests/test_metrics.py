@@ -83,22 +83,49 @@ def test_average_nees_has_scipys_bounds_and_skips_what_is_not_finite():
     assert all(np.isnan(a[2]) for a in got)
 
 
-def test_average_over_time_has_students_bounds():
-    means = RNG.normal(2.0, 0.3, 12)
-    got = metrics.anees_total(np.r_[means, np.nan], 2, confidence=0.99)
-    low, high = scipy.stats.t.interval(0.99, 11, loc=2.0, scale=scipy.stats.sem(means))
-    assert got == pytest.approx((means.mean(), 2.0, low, high))
-    assert metrics.verdict(metrics.anees_total([2.0], 2)) == "unknown"
-    assert np.isnan(metrics.anees_total([], 2).mean)
+def total(nees, dim, confidence=0.999):
+    return metrics.anees_total(nees.mean(1), (nees**2).mean(1), dim, confidence)
 
 
-def test_average_over_correlated_time_is_inside_as_often_as_it_says():
-    """500 studies of 20 runs whose NEES is good for 10 independent steps of 100: the naive bound is mostly wrong."""
-    runs = scipy.stats.chi2(2 * 10).rvs((500, 20), random_state=1) / 10
-    verdicts = [metrics.verdict(metrics.anees_total(means, 2, confidence=0.9)) for means in runs]
-    assert scipy.stats.binomtest(verdicts.count("inside"), 500, 0.9).pvalue > 1e-3
-    naive = scipy.stats.chi2.interval(0.9, 2 * 20 * 100)
-    assert np.mean([naive[0] <= 100 * means.sum() <= naive[1] for means in runs]) < 0.5
+def test_average_over_time_of_independent_steps_has_the_bounds_of_all_of_them():
+    nees = RNG.chisquare(2, (2000, 50))
+    got = total(nees, 2)
+    low, high = scipy.stats.chi2.interval(0.999, 2 * nees.size)
+    assert got.mean == pytest.approx(nees.mean())
+    assert (got.low, got.high) == pytest.approx(
+        (low / nees.size, high / nees.size), abs=0.15 * (high - low) / nees.size
+    )
+
+
+def test_average_over_time_of_constant_steps_has_the_bounds_of_one():
+    nees = np.repeat(RNG.chisquare(2, (2000, 1)), 50, axis=1)
+    low, high = scipy.stats.chi2.interval(0.999, 2 * 2000)
+    assert total(nees, 2)[2:] == pytest.approx((low / 2000, high / 2000), rel=1e-3)
+
+
+def test_average_over_time_of_next_to_nothing():
+    assert metrics.verdict(total(np.full((1, 9), 2.0), 2)) == "unknown"
+    assert np.isnan(metrics.anees_total([], [], 2).mean)
+    assert total(np.array([[1.0, 2.0], [2.0, 3.0], [np.nan, 1.0]]), 2).mean == 2.0
+
+
+@pytest.mark.parametrize("runs", [4, 40])
+@pytest.mark.parametrize("rho", [0.0, 0.95])
+def test_average_over_correlated_time_is_inside_as_often_as_it_says(runs, rho):
+    """400 studies of runs whose errors persist from step to step, as those of every filter do."""
+    error = RNG.normal(size=(400, runs, 60, 3))
+    for k in range(1, 60):
+        error[:, :, k] = rho * error[:, :, k - 1] + np.sqrt(1 - rho**2) * error[:, :, k]
+    studies = (error**2).sum(3)
+    hits = sum(metrics.verdict(total(nees, 3, confidence=0.9)) == "inside" for nees in studies)
+    assert scipy.stats.binomtest(hits, 400, 0.9).pvalue > 1e-4
+
+
+def test_runs_that_got_lost_do_not_widen_the_bounds_until_they_fit():
+    """Where a few runs are far off, the spread between runs is as large as the mean: it proves nothing."""
+    nees = RNG.chisquare(4, (200, 50))
+    nees[:10] *= 200.0
+    assert metrics.verdict(total(nees, 4)) == "above"
 
 
 def test_average_nis_counts_only_what_was_used():

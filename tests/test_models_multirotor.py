@@ -11,7 +11,6 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import jaxfilt as jf
-from jaxfilt import metrics
 from jaxfilt.models import multirotor as multirotors
 from jaxfilt.models import rotors, sensors
 from jaxfilt.models.control import GRAVITY, circle, controller, figure_eight, hover
@@ -39,18 +38,26 @@ def rotation(att) -> Rotation:
     return Rotation.from_quat(np.roll(np.asarray(att), -1, axis=-1))
 
 
-def fly(f, x, u, dt, steps):
-    """The states (steps + 1) under a held input."""
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def states(f, x, u, dt, steps):
+    """The states, the first of them x, under a held input."""
 
     def body(x, _):
         return f(x, u, dt), x
 
-    last, states = jax.jit(lambda x: jax.lax.scan(body, x, length=steps))(x)
-    return jax.tree.map(lambda a, b: np.concatenate([np.asarray(a), np.asarray(b)[None]]), states, last)
+    return jax.lax.scan(body, x, length=steps)[1]
+
+
+def fly(f, x, u, dt, steps):
+    """The same as NumPy arrays."""
+    return jax.tree.map(np.asarray, states(f, jax.tree.map(jnp.asarray, x), u, dt, steps))
+
+
+TUMBLING = jf.rk4(tumbling, BODY)
 
 
 def by_scipy(x, force_and_moment, t):
-    """The same body by solve_ivp, its attitude as a rotation matrix, R_dot = R [w]x; returns a function's values at t."""
+    """The same body at time t by solve_ivp, its attitude as a rotation matrix with R_dot = R [w]x."""
 
     def rate(_, y):
         v, R, w = y[3:6], y[6:15].reshape(3, 3), y[15:]
@@ -64,9 +71,9 @@ def by_scipy(x, force_and_moment, t):
     return y[:3], y[3:6], y[6:15].reshape(3, 3), y[15:]
 
 
-def error(x, want):
-    """Largest difference in position, velocity, rotation matrix and rates, at the end."""
-    got = x.pos[-1], x.vel[-1], rotation(x.att[-1]).as_matrix(), x.rates[-1]
+def error(x, k, want):
+    """Largest difference in position, velocity, rotation matrix and rates, after k steps."""
+    got = x.pos[k], x.vel[k], rotation(x.att[k]).as_matrix(), x.rates[k]
     return max(np.abs(a - b).max() for a, b in zip(got, want, strict=True))
 
 
@@ -74,7 +81,7 @@ def error(x, want):
 
 
 def test_without_torque_energy_and_momentum_are_conserved():
-    x = fly(jf.rk4(tumbling, BODY), SPINNING, (), 0.002, 1500)
+    x = fly(TUMBLING, SPINNING, (), 0.002, 1501)
     spin = 0.5 * (J * x.rates**2).sum(1)
     energy = spin + 0.5 * MASS * (x.vel**2).sum(1) + MASS * GRAVITY * x.pos[:, 2]
     np.testing.assert_allclose(spin, spin[0], rtol=1e-9)
@@ -86,8 +93,8 @@ def test_without_torque_energy_and_momentum_are_conserved():
 
 
 def test_free_tumbling_as_scipy_has_it():
-    x = fly(jf.rk4(tumbling, BODY), SPINNING, (), 0.002, 1000)
-    assert error(x, by_scipy(SPINNING, lambda v, R: (np.zeros(3), np.zeros(3)), 2.0)) < 1e-8
+    x = fly(TUMBLING, SPINNING, (), 0.002, 1501)
+    assert error(x, 1000, by_scipy(SPINNING, lambda v, R: (np.zeros(3), np.zeros(3)), 2.0)) < 1e-8
 
 
 @pytest.mark.parametrize(
@@ -102,7 +109,7 @@ def test_powered_flight_and_order_of_convergence(integrate, order):
 
     want = by_scipy(SPINNING, push, 0.4)
     f = integrate(flying, BODY)
-    errors = [error(fly(f, SPINNING, WRENCH, 0.4 / steps, steps), want) for steps in (80, 160)]
+    errors = [error(fly(f, SPINNING, WRENCH, 0.4 / steps, 161), steps, want) for steps in (80, 160)]
     assert errors[0] < {1: 0.3, 2: 5e-3, 4: 2e-6}[order]
     assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.15)
 
@@ -267,13 +274,6 @@ def test_the_sensors_of_a_multirotor():
     np.testing.assert_allclose(seam, [0.0, 0.0, 6.2 - 2 * math.pi], atol=1e-12)
 
 
-def test_a_model_has_no_faults():
-    x = jax.tree.map(jnp.asarray, SPINNING)
-    found = jf.check(multirotors.multirotor(), x, jnp.asarray(WRENCH), dt=0.01)
-    assert found.ok, str(found)
-    assert found.rank == 12
-
-
 # --- control -----------------------------------------------------------------------------------------------------
 
 STEPS, DT = 1500, 0.01
@@ -308,7 +308,7 @@ def flown(name):
 
 @pytest.mark.parametrize("name", AIRFRAMES)
 def test_the_controller_flies(name):
-    """From an offset to within a millimetre of hover, and along circle and eight within 15 cm, which is lag and drag."""
+    """From an offset to within a millimetre of hover, and along circle and eight within 15 cm: lag and drag."""
     (hovering, circling, eight), spin = flown(name)
     assert hovering[0] > 1
     assert hovering[800:].max() < 1e-3
@@ -338,59 +338,46 @@ def test_thrusts_are_those_that_rotors_have():
 
 # --- filters -----------------------------------------------------------------------------------------------------
 
+LEVEL = RigidBody(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+
+
+def cast(tree, dtype):
+    """Every floating leaf in this dtype."""
+    return jax.tree.map(lambda a: jnp.asarray(a, dtype if np.asarray(a).dtype.kind == "f" else None), tree)
+
 
 @pytest.mark.long
-@pytest.mark.parametrize("make", [jf.ekf, jf.ukf], ids=["ekf", "ukf"])
-def test_gradients_at_zero_angle_are_finite(make):
+@pytest.mark.parametrize(("make", "dtype"), [(jf.ekf, jnp.float32), (jf.ukf, jnp.float64)], ids=["ekf", "ukf"])
+def test_gradients_at_zero_angle_are_finite(make, dtype):
     """Hovering level with zero innovation: every square root and quotient of the attitude at its worst."""
-    theta = jax.tree.map(jnp.asarray, multirotors.HUMMINGBIRD)
-    x = RigidBody(jnp.zeros(3), jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
-    z = (jnp.zeros(3), x.att)
-    u = jnp.array([0.716 * GRAVITY, 0.0, 0.0, 0.0])
+    theta, x = cast(multirotors.HUMMINGBIRD, dtype), cast(LEVEL, dtype)
+    u = jnp.asarray([0.716 * GRAVITY, 0.0, 0.0, 0.0], dtype)
 
-    def loglik(theta, z):
+    def cost(theta, z):
         filt = make(multirotors.multirotor(theta))
-        belief = jf.Gaussian(x, multirotors.multirotor_start(theta).cov)
-        log = jf.Log(jnp.full(2, 0.01), u[None].repeat(2, 0), {"pose": jax.tree.map(lambda a: jnp.stack([a, a]), z)}, {}, {})
-        return jf.log_likelihood(filt, belief, log)
+        belief = filt.predict(jf.Gaussian(x, multirotors.multirotor_start(theta).cov), u, 0.01)
+        if make is jf.ekf:  # the UKF's update takes as long to compile again and passes the same attitudes
+            belief, _ = filt.update(belief, z, "pose")
+        return belief.cov.sum() + filt.model.space.minus(belief.mean, x).sum()
 
-    slopes = jax.jit(jax.grad(loglik, argnums=(0, 1)))(theta, z)
+    slopes = jax.jit(jax.grad(cost, argnums=(0, 1)))(theta, (x.pos, x.att))
     for leaf in jax.tree.leaves(slopes):
+        assert leaf.dtype == dtype
         assert np.isfinite(leaf).all()
-    assert np.abs(slopes[0]["pose"][0]) > 1, "six components of two readings are worth more or less with their noise"
+    assert slopes[0]["start"][2] > 0, "the less is known of the attitude at the start, the less after"
+    assert slopes[0]["mass"] < -0.01, "the heavier, the less it climbs"
 
 
-@functools.cache
-def simulated(scenario, dtype, runs, steps):
-    s = scenario()
-    theta = jax.tree.map(lambda a: jnp.asarray(a, dtype), s.theta)
-    log = jax.tree.map(lambda a: a.astype(dtype) if a.dtype == np.float64 else a, s.schedule(steps))
-
-    @jax.jit
-    def study(keys):
-        model, belief = s.model(theta), s.belief(theta)
-        truth, logs = jax.vmap(lambda key: jf.simulate(model, belief, log, key, s.control))(keys)
-        rows = log._replace(u=logs.u, z=logs.z)
-        beliefs = jf.scan_runs(jf.ekf(model), belief, rows, batched=("u", "z"), store=lambda b, info: b)
-        errors = metrics.errors(model.space, truth, beliefs.mean)
-        return truth, beliefs, metrics.nees(errors, beliefs.cov)
-
-    return log.u.pos, *study(jax.random.split(jax.random.key(8), runs))
-
-
-@pytest.mark.long
-def test_the_usual_flight_in_float32_is_consistent():
-    path, truth, beliefs, nees = simulated(multirotors.scenario, jnp.float32, 40, 150)
-    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(beliefs))
-    assert metrics.verdict(metrics.anees_total(np.asarray(nees).mean(1), 12)) == "inside"
-    assert metrics.share_inside(metrics.anees(nees, 12)) > 0.97
-    assert np.linalg.norm(np.asarray(truth.pos)[:, :-1] - path[1:], axis=-1).max() < 0.6
-
-
-@pytest.mark.long
-def test_the_harsh_flight_finds_the_ekf_out():
-    _, truth, beliefs, nees = simulated(multirotors.harsh_scenario, jnp.float64, 60, 200)
-    average = metrics.anees(nees, 12)
-    assert metrics.share_inside(average) < 0.2
-    assert np.median(np.asarray(nees).mean(1)) > 15
-    assert np.isfinite(nees).all()
+@pytest.mark.parametrize("name", ["scenario", "harsh_scenario", "euler_scenario"])
+def test_scenarios_fly_their_path_in_float32(name):
+    scenario = getattr(multirotors, name)()
+    theta = cast(scenario.theta, jnp.float32)
+    model, belief = scenario.model(theta), scenario.belief(theta)
+    log = cast(scenario.schedule(1200), jnp.float32)
+    truth, flown_log = jax.jit(lambda key: jf.simulate(model, belief, log, key, scenario.control))(jax.random.key(4))
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((truth, flown_log.u, flown_log.z)))
+    assert flown_log.u.shape == (1200, 4)
+    away = np.linalg.norm(truth.pos[:-1] - log.u.pos[1:], axis=1)
+    assert away[400:].max() < (1.2 if name == "harsh_scenario" else 0.5)
+    indices = sorted(i for block, _ in scenario.blocks.values() for i in block)
+    assert indices == list(range(model.space.dim))

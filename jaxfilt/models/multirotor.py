@@ -191,7 +191,8 @@ def split_step(rate: Rate, space: Space) -> Callable[[PyTree, PyTree, Array], Py
 
     ``w_m = w + dt/2 w_dot(w)``, ``q' = q Exp(dt w_m)``, ``w' = w + dt w_dot(w_m)``; ``v' = v + dt/2 (a + a')`` with a'
     at the turned attitude, ``p' = p + dt/2 (v + v')``. It wants angular accelerations that depend on the rates alone.
-    In a filter it compiles in a fourth of the time of `rk4` and at 100 Hz the difference is far below any noise.
+    At 100 Hz it differs from `rk4` by less than a hundredth of the noise of one step, and an EKF with it compiles in
+    half the time and runs twice as fast.
 
     Args:
         rate: function of (x, u), x and its value a `RigidBody`.
