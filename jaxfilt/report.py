@@ -226,11 +226,13 @@ def _columns(fig: Figure, *heights: list[int]) -> list[list[Axes]]:
     return columns
 
 
-def _share_time(column: list[Axes], label: str = "time (s)") -> None:
+def _share_time(column: list[Axes], t: np.ndarray) -> None:
     for axes in column[:-1]:
         axes.sharex(column[-1])
         axes.tick_params(labelbottom=False)
-    column[-1].set_xlabel(label)
+    margin = 0.02 * (t[-1] - t[0]) or 1.0
+    column[-1].set_xlim(t[0] - margin, t[-1] + margin)
+    column[-1].set_xlabel("time (s)")
 
 
 def _study_figure(s: Study, name: str) -> Figure:
@@ -256,15 +258,16 @@ def _study_figure(s: Study, name: str) -> Figure:
         _logarithmic(axes, [scores.rmse[block] for scores in s.scores.values()])
         axes.set_ylabel(_with_unit(block, unit))
     errors[0].set_title("RMSE over the runs", fontsize="medium")
-    _share_time(errors)
+    _share_time(errors, s.t)
     series = {"NEES": [scores.nees for scores in s.scores.values()]}
     series |= {f"NIS {sensor}": [scores.nis[sensor] for scores in s.scores.values()] for sensor in sensors}
     for axes, (label, all_scores) in zip(squares, series.items(), strict=True):
         _draw_consistency(axes, s.t, all_scores)
         axes.set_ylabel(f"mean {label}")
     squares[0].set_title(f"consistency, with {100 * s.confidence:g} % bounds", fontsize="medium")
-    _share_time(squares)
-    _legend(fig, list(s.scores))
+    _share_time(squares, s.t)
+    lost = {filt: int(scores.diverged.sum()) for filt, scores in s.scores.items()}
+    _legend(fig, [f"{filt} ({n:,} of {s.runs:,} runs diverged)" if n else filt for filt, n in lost.items()])
     return fig
 
 
@@ -405,7 +408,7 @@ def _replay_figure(r: Replayed, name: str) -> Figure:
         "error, with 3 sigma" if r.truth is not None else "3 sigma of the estimate; nobody knows the error",
         fontsize="medium",
     )
-    _share_time(errors)
+    _share_time(errors, t)
     for axes, sensor in zip(checks[::2], sensors, strict=True):
         _draw_nis(axes, t, [review.info[sensor] for review in reviews.values()], r.confidence)
         axes.set_ylabel(f"NIS {sensor}")

@@ -1,5 +1,7 @@
 """Studies: known answers, the same scores from plain numpy, the same numbers however the runs are dealt out."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 import scipy.stats
 
 import jaxfilt as jf
-from jaxfilt import metrics
+from jaxfilt import metrics, report
 from jaxfilt.study import replayed, study
 
 TRACED = []
@@ -209,6 +211,21 @@ def test_the_first_fault_is_named_and_broken_runs_do_not_spoil_the_rest(controll
     error = np.where(good, controlled.truth - np.where(good, scores.mean, 0.0), np.nan)
     step = 15
     assert scores.rmse["x[0]"][step] == pytest.approx(np.sqrt(np.nanmean(error[:, step] ** 2)))
+
+
+def test_a_report_of_broken_runs_is_still_json_and_a_picture(controlled, tmp_path):
+    out = report.write(controlled, tmp_path / "new" / "folder", "unstable")
+    found = json.loads((out / "summary.json").read_text())
+    assert found["name"] == "unstable"
+    ekf = found["filters"]["ekf"]
+    assert ekf["diverged"] == controlled.scores["ekf"].diverged.sum()
+    assert ekf["first_fault"]["step"] == controlled.scores["ekf"].fault.step
+    assert ekf["rmse"]["x[0]"] == {
+        "value": pytest.approx(controlled.scores["ekf"].rmse_total["x[0]"], rel=1e-5),
+        "unit": "",
+    }
+    assert found["settings"]["theta"] == {"r": 0.1}
+    assert (out / "study.png").stat().st_size > 20_000
 
 
 def test_single_precision_stays_single():
