@@ -208,7 +208,9 @@ def _update(
 
     def correct(transform: Transform) -> tuple:
         m = transform(h, belief, model.space, sensor.space)
-        r, S, cross = _observed(there, sensor.space.minus(z, m.mean), linalg.symmetrize(m.cov + R), m.cross)
+        # The shift comes after the difference is taken: J d is no angle and must not be wrapped like one.
+        r = sensor.space.minus(z, m.mean) + m.shift
+        r, S, cross = _observed(there, r, linalg.symmetrize(m.cov + R), m.cross)
         L = linalg.cholesky(S)
         return m, r, S, L, linalg.gain(cross, L)
 

@@ -32,7 +32,8 @@ def taylor(g: Callable, belief: Gaussian, space_in: Space, space_out: Space, at:
         belief: Gaussian on space_in, dimension n.
         space_in: the space of x.
         space_out: the space of g(x).
-        at: (n,) tangent offset from the mean of the point to expand about, default 0; for iterated filters.
+        at: (n,) tangent offset from the mean of the point to expand about, for iterated filters: the mean is then g
+            there, and the shift ``J at``. Default: about the mean itself.
 
     Source: S. Sarkka, Bayesian Filtering and Smoothing (2013), eq. 5.26; in the tangent space as in Sola et al.,
     A micro Lie theory for state estimation in robotics (2018), eqs. 31 and 41.
@@ -48,7 +49,7 @@ def taylor(g: Callable, belief: Gaussian, space_in: Space, space_out: Space, at:
         A = jnp.eye(space_in.dim, dtype=P.dtype) - K @ J
         return A @ P @ A.T
 
-    return Moments(y if at is None else space_out.plus(y, -J @ offset), J @ PJ, PJ, remainder)
+    return Moments(y, J @ PJ, PJ, remainder, 0.0 if at is None else J @ offset)
 
 
 def taylor_at(offset: jax.Array) -> Transform:

@@ -52,7 +52,7 @@ def around(switch: float, dtype) -> np.ndarray:
 
 def jet(f):
     """The value, the derivative by forward mode, the second by reverse over forward, as an EKF's gradient takes it."""
-    return jax.jit(jax.vmap(lambda x: (f(x), jax.jacfwd(f)(x), jax.grad(jax.jacfwd(f))(x))))
+    return jax.jit(jax.vmap(lambda *x: (f(*x), jax.jacfwd(f)(*x), jax.grad(jax.jacfwd(f))(*x))))
 
 
 def assert_jet(f, coefficient, x: np.ndarray) -> None:

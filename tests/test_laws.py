@@ -252,6 +252,29 @@ def test_the_iterated_filter_finds_the_most_probable_state():
     jax.tree.map(np.testing.assert_array_equal, first, once)
 
 
+def test_the_iterated_filter_knows_an_angle_from_its_linearisation():
+    """A landmark two metres away and a prior of two metres: its bearing turns by more than half a turn on the way, and
+    ``H d`` with it. Against the book's Gauss-Newton, whose residual alone is an angle."""
+    s = system("car")
+    theta = dict(s.theta, mark=np.log([0.3, 0.05]))
+    book, mark = s.book(theta), np.array([2.0, 0.0])
+    correct, sensor = oracles.iekf_correct(6), book.sensors["mark"]
+    P = np.diag([4.0, 4.0, 0.01, 1.0])
+    belief = jf.Gaussian(Car(np.zeros(2), np.array(0.0), np.array(1.0)), P)
+    update = jax.jit(lambda z: jf.iekf(car_model(theta), iterations=6).update(belief, z, "mark", mark)[0].mean)
+    rng, beyond = np.random.default_rng(6), 0
+    for _ in range(100):
+        x = np.append(rng.normal(0, 2, 2), [0.0, 1.0])
+        z = sensor.h(x, mark) + rng.normal(size=2) * [0.3, 0.05]
+        z[1] = np.angle(np.exp(1j * z[1]))
+        want = correct(book, sensor, np.array([0.0, 0.0, 0.0, 1.0]), P, z, mark, np.arange(2))[0]
+        got = update((z[0], z[1]))
+        np.testing.assert_allclose(CAR.minus(got, Car(want[:2], np.array(want[2]), want[3])), 0.0, atol=1e-6)
+        d = want - [0.0, 0.0, 0.0, 1.0]
+        beyond += abs(sensor.minus(z, sensor.h(want, mark))[1] + sensor.H(want, mark)[1] @ d) > np.pi
+    assert beyond > 0
+
+
 # --- models that change with the row -----------------------------------------------------------------------------
 
 
