@@ -125,7 +125,8 @@ class Log(NamedTuple):
     ``dt`` (T,) s. ``u`` a pytree (``()``: no input). ``z`` a dict sensor -> readings in their natural shape.
     ``c`` a dict sensor -> context, absent: ``()``. ``valid`` a dict sensor -> (T,) bool, or (T, m) where single
     components can be missing; a sensor absent from ``valid`` is there in every row. A missing reading is
-    ``valid = False`` with any finite number in ``z``, never NaN: NaN would poison reverse mode.
+    ``valid = False`` with any proper point of the sensor's space in ``z`` (a unit quaternion for an attitude, not
+    zeros), never NaN: a batch computes the update before it drops it, and NaN would poison reverse mode.
     """
 
     dt: Array
