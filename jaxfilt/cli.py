@@ -8,7 +8,7 @@ import importlib.util
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -117,13 +117,13 @@ def study(
     table = _table(f"{label}: {runs:,} runs of {steps:,} steps, {dtype}, seed {seed}", list(makers))
     scores = list(result.scores.values())
     for block, (_, unit) in result.blocks.items():
-        table.add_row(_with_unit(f"RMSE {block}", unit), *[f"{s.rmse_total[block]:.4g}" for s in scores])
+        _row(table, _with_unit(f"RMSE {block}", unit), [f"{s.rmse_total[block]:.4g}" for s in scores])
     table.add_section()
-    table.add_row(f"mean NEES ({scores[0].nees_total.expected:g})", *[_judged(s.nees_total) for s in scores])
+    _row(table, f"mean NEES ({scores[0].nees_total.expected:g})", [_judged(s.nees_total) for s in scores])
     for sensor, score in scores[0].nis_total.items():
-        table.add_row(f"mean NIS {sensor} ({score.expected:g})", *[_judged(s.nis_total[sensor]) for s in scores])
+        _row(table, f"mean NIS {sensor} ({score.expected:g})", [_judged(s.nis_total[sensor]) for s in scores])
     table.add_section()
-    table.add_row("diverged runs", *[_count(int(s.diverged.sum())) for s in scores])
+    _row(table, "diverged runs", [_count(int(s.diverged.sum())) for s in scores])
     _print(table)
     for name, s in result.scores.items():
         if s.fault is not None:
@@ -165,16 +165,16 @@ def replay(
     reviews = list(result.reviews.values())
     if result.truth is not None:
         for block, (_, unit) in result.blocks.items():
-            table.add_row(_with_unit(f"RMSE {block}", unit), *[f"{r.rmse[block]:.4g}" for r in reviews if r.rmse])
-        table.add_row(f"mean NEES ({result.space.dim})", *[f"{r.nees_mean.mean:.4g}" for r in reviews if r.nees_mean])
+            _row(table, _with_unit(f"RMSE {block}", unit), [f"{r.rmse[block]:.4g}" for r in reviews if r.rmse])
+        _row(table, f"mean NEES ({result.space.dim})", [f"{r.nees_mean.mean:.4g}" for r in reviews if r.nees_mean])
         table.add_section()
     for sensor, score in reviews[0].nis.items():
-        table.add_row(f"mean NIS {sensor} ({score.expected:.4g})", *[_judged(r.nis[sensor]) for r in reviews])
-        table.add_row(f"white at lags, {sensor}", *[_white(r.whiteness[sensor]) for r in reviews])
+        _row(table, f"mean NIS {sensor} ({score.expected:.4g})", [_judged(r.nis[sensor]) for r in reviews])
+        _row(table, f"white at lags, {sensor}", [_white(r.whiteness[sensor]) for r in reviews])
         if threshold is not None:
-            table.add_row(f"refused, {sensor}", *[_share(r.refused[sensor], r.info[sensor].status) for r in reviews])
+            _row(table, f"refused, {sensor}", [_share(r.refused[sensor], r.info[sensor].status) for r in reviews])
     table.add_section()
-    table.add_row("diverged", *["[red]yes[/]" if r.diverged else "no" for r in reviews])
+    _row(table, "diverged", ["[red]yes[/]" if r.diverged else "no" for r in reviews])
     _print(table)
     _finish(result, folder, label)
 
@@ -367,11 +367,19 @@ def _table(title: str, filters: list[str]) -> Table:
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    print(title)  # not the table's own title, which would be as narrow as the table
+    table = Table(box=box.SIMPLE_HEAD)
     table.add_column("")
     for name in filters:
         table.add_column(name)
     return table
+
+
+def _row(table: Table, label: str, cells: Iterable[str]) -> None:
+    """A row; the label is a user's, and no markup."""
+    from rich.text import Text
+
+    table.add_row(Text(label), *cells)
 
 
 def _with_unit(name: str, unit: str) -> str:

@@ -24,8 +24,8 @@ from jaxfilt.run import scan
 from jaxfilt.simulate import simulate
 from jaxfilt.types import Array, Filter, Gaussian, Info, Log, Model, PyTree, Replay, Space, Status, Truth
 
-MEMORY = 64e6
-"""Bytes that the runs of one chunk may take, about: what is simulated is kept until the filters have read it."""
+MEMORY = 32e6
+"""Bytes that one chunk may take, about: what is simulated is kept until the filters have read it."""
 
 Filters = Mapping[str, Callable[[PyTree], Filter]]
 
