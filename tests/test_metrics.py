@@ -62,6 +62,16 @@ def test_nees_of_an_indefinite_covariance_is_not_a_number():
     assert np.isnan(metrics.nees(jnp.ones(2), jnp.diag(jnp.array([1.0, -1.0]))))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_log_score_is_the_density_of_the_error(dtype):
+    e, P = RNG.normal(size=(3, 5, 4)), covariances(3, 5, n=4)
+    expected = [[scipy.stats.multivariate_normal(cov=P[i, j]).logpdf(e[i, j]) for j in range(5)] for i in range(3)]
+    got = metrics.log_score(jnp.asarray(e, dtype), jnp.asarray(P, dtype))
+    assert got.dtype == dtype
+    np.testing.assert_allclose(got, expected, rtol=1e-4 if dtype == np.float32 else 1e-12)
+    assert np.isnan(metrics.log_score(jnp.ones(2), jnp.diag(jnp.array([1.0, -1.0]))))
+
+
 def test_rmse_is_the_length_of_the_error_over_what_counts():
     e = RNG.normal(size=(6, 7, 3))
     mask = RNG.random((6, 7)) < 0.5
@@ -80,77 +90,19 @@ def test_average_nees_has_scipys_bounds_and_skips_what_is_not_finite():
         low, high = scipy.stats.chi2.interval(0.95, 3 * runs)
         assert got.mean[step] == pytest.approx(values[-runs:, step].mean())
         assert (got.low[step], got.high[step], got.expected[step]) == pytest.approx((low / runs, high / runs, 3))
+        assert got.p[step] == pytest.approx(2 * min(tails(got.mean[step] * runs, 3 * runs)))
     assert all(np.isnan(a[2]) for a in got)
 
 
-def total(nees, dim, confidence=0.999):
-    return metrics.anees_total(nees.mean(1), (nees**2).mean(1), dim, confidence)
-
-
-def test_average_over_time_of_independent_steps_has_the_bounds_of_all_of_them():
-    nees = RNG.chisquare(2, (2000, 50))
-    got = total(nees, 2)
-    low, high = scipy.stats.chi2.interval(0.999, 2 * nees.size)
-    assert got.mean == pytest.approx(nees.mean())
-    assert (got.low, got.high) == pytest.approx(
-        (low / nees.size, high / nees.size), abs=0.15 * (high - low) / nees.size
-    )
-
-
-def test_average_over_time_of_constant_steps_has_the_bounds_of_one():
-    nees = np.repeat(RNG.chisquare(2, (2000, 1)), 50, axis=1)
-    low, high = scipy.stats.chi2.interval(0.999, 2 * 2000)
-    assert total(nees, 2)[2:] == pytest.approx((low / 2000, high / 2000), rel=1e-3)
-
-
-def test_average_over_time_of_next_to_nothing():
-    assert metrics.verdict(total(np.full((1, 9), 2.0), 2)) == "unknown"
-    assert np.isnan(metrics.anees_total([], [], 2).mean)
-    assert total(np.array([[1.0, 2.0], [2.0, 3.0], [np.nan, 1.0]]), 2).mean == 2.0
-
-
-@pytest.mark.parametrize("runs", [4, 40])
-@pytest.mark.parametrize("rho", [0.0, 0.95])
-def test_average_over_correlated_time_is_inside_as_often_as_it_says(runs, rho):
-    """400 studies of runs whose errors persist from step to step, as those of every filter do."""
-    error = RNG.normal(size=(400, runs, 60, 3))
-    for k in range(1, 60):
-        error[:, :, k] = rho * error[:, :, k - 1] + np.sqrt(1 - rho**2) * error[:, :, k]
-    studies = (error**2).sum(3)
-    hits = sum(metrics.verdict(total(nees, 3, confidence=0.9)) == "inside" for nees in studies)
-    assert scipy.stats.binomtest(hits, 400, 0.9).pvalue > 1e-4
-
-
-def test_runs_that_got_lost_do_not_widen_the_bounds_until_they_fit():
-    """Where a few runs are far off, the spread between runs is as large as the mean: it proves nothing."""
-    nees = RNG.chisquare(4, (200, 50))
-    nees[:10] *= 200.0
-    assert metrics.verdict(total(nees, 4)) == "above"
+def tails(total, dof):
+    return scipy.stats.chi2.cdf(total, dof), scipy.stats.chi2.sf(total, dof)
 
 
 def test_average_nis_counts_only_what_was_used():
     i = info([1.0, 2.0, 50.0, 4.0, np.nan, 0.0], [2, 1, 0, 2, 2, 0], [OK, OK, GATED, OK, BAD, ABSENT])
     low, high = scipy.stats.chi2.interval(0.9, 5)
-    assert metrics.anis(i, confidence=0.9) == pytest.approx((7 / 3, 5 / 3, low / 3, high / 3))
+    assert metrics.anis(i, confidence=0.9) == pytest.approx((7 / 3, 5 / 3, low / 3, high / 3, 2 * min(tails(7, 5))))
     assert np.isnan(metrics.anis(info([0.0], [0], [ABSENT])).mean)
-
-
-def test_chi_square_bounds_of_many_degrees_of_freedom():
-    got = metrics.mean_of_squares(np.array(2.0e7), np.array(2 * 10**7), np.array(10**7), 0.999)
-    low, high = scipy.stats.chi2.interval(0.999, 2e7)
-    assert (float(got.low), float(got.high)) == pytest.approx((low / 1e7, high / 1e7), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("mean", "expected"), [(2.0, "inside"), (3.0, "above"), (0.5, "below"), (np.nan, "unknown"), (np.inf, "above")]
-)
-def test_verdict(mean, expected):
-    assert metrics.verdict(metrics.Consistency(mean, 2.0, 1.0, 2.5)) == expected
-
-
-def test_share_inside_is_of_the_steps_that_have_bounds():
-    score = metrics.Consistency(np.array([1.0, 2.0, 9.0, np.nan]), 2.0, np.full(4, 0.5), np.full(4, 3.0))
-    assert metrics.share_inside(score) == pytest.approx(2 / 3)
 
 
 def test_a_run_has_diverged_if_it_is_lost_at_the_end_or_was_ever_unsound():
@@ -158,6 +110,8 @@ def test_a_run_has_diverged_if_it_is_lost_at_the_end_or_was_ever_unsound():
     last = np.array([4.0, 0.999 * threshold, 1.001 * threshold, 4.0, np.nan])
     sound = np.array([True, True, True, False, False])
     assert metrics.diverged(last, sound, 4).tolist() == [False, False, True, True, True]
+    assert metrics.divergence_threshold(4) == pytest.approx(threshold, rel=1e-6)
+    assert type(metrics.divergence_threshold(4)) is float  # weakly typed inside jit
 
 
 def coloured(rho, length, m=2, seed=0):
@@ -200,3 +154,38 @@ def test_whiteness_of_little_or_nothing():
     assert len(metrics.whiteness(info(np.zeros(5), np.zeros(5, int), np.full(5, ABSENT))).lags) == 0
     with pytest.raises(ValueError, match=r"info: expected leading axis T, one run, got float64\[2, 3\]"):
         metrics.whiteness(info(np.zeros((2, 3)), np.zeros((2, 3), int), np.zeros((2, 3), int)))
+
+
+def sums_of(studies):
+    """Sums over runs of the products at lags 1 to 5, as a study keeps them, from e (runs, T, m)."""
+    runs, T, m = studies.shape
+    dots = np.array([(studies[:, :-lag] * studies[:, lag:]).sum() for lag in range(1, 6)])
+    pairs = np.array([runs * (T - lag) * m for lag in range(1, 6)])
+    return metrics.whiteness_of_sums(dots, pairs, (studies**2).sum(), runs * T * m, confidence=0.9)
+
+
+def test_whiteness_of_many_runs_holds_as_often_as_it_says_and_finds_colour():
+    rng, inside = np.random.default_rng(4), []
+    for _ in range(100):
+        white = sums_of(rng.normal(size=(20, 30, 2)))
+        inside += (np.abs(white.autocorrelation) <= white.bound).tolist()
+    assert scipy.stats.binomtest(sum(inside), len(inside), 0.9).pvalue > 1e-3
+    found = sums_of(np.stack([coloured(0.3, 200, seed=seed)[1] for seed in range(30)]))
+    np.testing.assert_allclose(found.autocorrelation, 0.3 ** np.arange(1, 6), atol=0.03)
+    assert found.bound[0] == pytest.approx(1.6449 / np.sqrt(30 * 199 * 2), rel=1e-4)
+    assert found.lags.tolist() == [1, 2, 3, 4, 5]
+
+
+def test_whiteness_does_not_ask_for_innovations_of_the_right_size():
+    small, large = (sums_of(scale * np.stack([coloured(0.3, 200)[1]])) for scale in (1.0, 5.0))
+    np.testing.assert_allclose(small.autocorrelation, large.autocorrelation, rtol=1e-12)
+
+
+def test_whiteness_of_no_pairs():
+    white = metrics.whiteness_of_sums(np.array([3.0, 0.0]), np.array([4, 0]), 8.0, 8)
+    assert (white.autocorrelation[0], np.isnan(white.autocorrelation[1]), np.isnan(white.bound[1])) == (
+        0.75,
+        True,
+        True,
+    )
+    assert np.isnan(metrics.whiteness_of_sums(np.zeros(2), np.zeros(2), 0.0, 0).autocorrelation).all()
