@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jaxfilt.models import altitude, car, ctrv, lti, multirotor, textbook, wheeled
+from jaxfilt.models import altitude, car, ctrv, falling, growth, lti, multirotor, textbook, tracking, wheeled
 from jaxfilt.types import Scenario
 
 SCENARIOS: dict[str, Callable[[], Scenario]] = {
@@ -28,6 +28,11 @@ SCENARIOS: dict[str, Callable[[], Scenario]] = {
     "gps-accelerometer-robot": textbook.gps_accelerometer_robot_scenario,
     "lti": lti.lti_scenario,
     "hidden-bias": lti.hidden_bias_scenario,
+    "growth": growth.growth_scenario,
+    "bearings-only": tracking.bearings_only_scenario,
+    "coordinated-turn": tracking.coordinated_turn_scenario,
+    "reentry": falling.reentry_scenario,
+    "falling-body": falling.falling_body_scenario,
 }
 """Name -> function that returns its `Scenario`; the first line of its docstring says what happens."""
 
