@@ -1,5 +1,7 @@
 """jaxfilt: differentiable, batched Kalman filters in JAX."""
 
+from jaxfilt.bootstrap import block_bootstrap
+from jaxfilt.bound import Bound, cramer_rao, efficiency
 from jaxfilt.check import Checkup, check
 from jaxfilt.diagnose import Diagnosis, diagnose
 from jaxfilt.elementary import bearing, cosc, norm, sinc, wrap
@@ -7,13 +9,17 @@ from jaxfilt.files import load, save
 from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
 from jaxfilt.integrate import euler, rk4
 from jaxfilt.log import align, merge, schedule, stack, validate
+from jaxfilt.mismatch import scaled
 from jaxfilt.models.linear import linear
 from jaxfilt.models.sensors import range_bearing
 from jaxfilt.noise import Parametrisation, blocks, const, diagonal, log_cholesky, log_std, van_loan, white
+from jaxfilt.review import Replayed, Review, replayed
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
+from jaxfilt.scores import Paired, Scores
 from jaxfilt.simulate import Simulation, sample, simulate
 from jaxfilt.spaces import angle, product, rotate, rotate_back, scalar, so2, so3, so3_exp, so3_log, vector
-from jaxfilt.study import Study, study
+from jaxfilt.study import Interrupted, Study, study
+from jaxfilt.sweep import Sweep, sweep
 from jaxfilt.transforms import cubature, gauss_hermite, taylor, unscented
 from jaxfilt.types import (
     Filter,
@@ -32,44 +38,57 @@ from jaxfilt.types import (
     Track,
     Truth,
 )
+from jaxfilt.verdict import Verdict, innovation_verdict, verdicts
 
 __all__ = [
+    "Bound",
     "Checkup",
     "Diagnosis",
     "Filter",
     "Gaussian",
     "Info",
+    "Interrupted",
     "Log",
     "Model",
     "Moments",
+    "Paired",
     "Parametrisation",
     "Recording",
     "Replay",
+    "Replayed",
+    "Review",
     "Scenario",
+    "Scores",
     "Sensor",
     "Simulation",
     "Space",
     "Status",
     "Stream",
     "Study",
+    "Sweep",
     "Track",
     "Truth",
+    "Verdict",
     "align",
     "angle",
     "bearing",
+    "block_bootstrap",
     "blocks",
     "build",
     "check",
     "ckf",
     "const",
     "cosc",
+    "cramer_rao",
     "cubature",
     "diagnose",
     "diagonal",
+    "efficiency",
     "ekf",
     "euler",
     "gauss_hermite",
     "iekf",
+    "innovation_verdict",
     "kf",
     "linear",
     "load",
@@ -82,12 +101,14 @@ __all__ = [
     "norm",
     "product",
     "range_bearing",
+    "replayed",
     "rk4",
     "rotate",
     "rotate_back",
     "sample",
     "save",
     "scalar",
+    "scaled",
     "scan",
     "scan_runs",
     "schedule",
@@ -99,12 +120,14 @@ __all__ = [
     "so3_log",
     "stack",
     "study",
+    "sweep",
     "taylor",
     "ukf",
     "unscented",
     "validate",
     "van_loan",
     "vector",
+    "verdicts",
     "white",
     "wrap",
 ]

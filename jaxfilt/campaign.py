@@ -52,7 +52,7 @@ def run(
     interrupted = False
     try:
         for part in _parts(task, program, arguments, done):
-            state = part if state is None else added(state, part, task.plan.sample)
+            state = part if state is None else added(state, part, task.sample)
             if book is not None:
                 checkpoint.save(book, state, int(state.done))
             if progress:

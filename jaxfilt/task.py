@@ -54,7 +54,7 @@ class Options(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What is to be run: ``theta``, ``truth_theta``, ``log`` and ``key`` (its data) are arguments of the plan's program.
+    """What is to be run: ``theta``, ``truth_theta``, ``log`` and ``key`` (its data) are the arguments of a program.
 
     ``settings`` of a sweep, 1 without; ``about`` says in a checkpoint what the study is.
     """
@@ -65,6 +65,7 @@ class Task(NamedTuple):
     log: Log
     key: np.ndarray
     runs: int
+    sample: int
     settings: int
     chunk: int
     workers: int
@@ -147,6 +148,7 @@ def task_of(
         log=log,
         key=np.asarray(jax.random.key_data(key)),
         runs=o.runs,
+        sample=min(o.sample, o.runs),
         settings=len(settings),
         chunk=chunk,
         workers=workers,
