@@ -125,15 +125,15 @@ def study(
         "resume": resume,
     }
     with explained(source), terminal.progress_bar() as progress:
-        asked.rescaled(chosen.model(chosen.theta), believed | over)
+        asked.rescaled(chosen.model(chosen.theta), believed | dict.fromkeys(over, 1.0))
         options |= {"progress": progress, "corrupt": asked.corruption(corrupt or [], chosen.model, chosen.theta)}
         robot = chosen.model, bank, functools.partial(_believed, chosen.belief), log, key
         try:
             if over:
-                theta = lambda **factors: (chosen.theta, believed | factors)  # noqa: E731
+                theta = lambda **factors: {"robot": chosen.theta, "assumed": believed | factors}  # noqa: E731
                 result = many_studies(*robot, over, theta=theta, truth_theta=chosen.theta, **options)
             else:
-                theta = chosen.theta, believed
+                theta = {"robot": chosen.theta, "assumed": believed}
                 result = monte_carlo(*robot, theta=theta, truth_theta=chosen.theta, **options)
             interrupted = False
         except Interrupted as stopped:
@@ -190,13 +190,12 @@ def replay(
 
 
 def _assuming(make: Callable[..., Filter], model: Callable[[PyTree], Model], theta: PyTree) -> Filter:
-    """A filter of theta = (the scenario's own, factors of noises)."""
-    own, factors = theta
-    return make(asked.rescaled(model(own), factors))
+    """A filter that knows the robot's parameters, and takes its noises for so many times what they are."""
+    return make(asked.rescaled(model(theta["robot"]), theta["assumed"]))
 
 
 def _believed(belief: Callable[[PyTree], Gaussian], theta: PyTree) -> Gaussian:
-    return belief(theta[0])
+    return belief(theta["robot"])
 
 
 def _built(make: Callable[..., Filter], model: Callable[[PyTree], Model], gate: float | None, theta: PyTree) -> Filter:

@@ -18,17 +18,20 @@ from jaxfilt.run import scan
 from jaxfilt.scores import Fault
 from jaxfilt.task import Filters, checked, checked_blocks, strong
 from jaxfilt.types import Gaussian, Info, Log, PyTree, Replay, Space, Status, Truth
+from jaxfilt.verdict import Verdict, innovation_verdict
 
 
 class Review(NamedTuple):
-    """How one filter did on a recording.
+    """How one filter did on a recording: the ``verdict`` in words, and what it stands on.
 
     ``mean`` (T, ...) the part of the state that the truth knows, ``std`` (T, d) of its tangent, ``info`` sensor ->
     `Info`, leading axis T. With a truth, else None: ``error`` (T, d), NaN where it is unknown, ``nees`` (T,), ``rmse``
-    by block and ``nees_mean``, whose bounds are those of a block bootstrap: the NEES of one run is correlated in time. ``nis``,
-    ``whiteness`` and ``refused`` (readings that a gate refused) by sensor. ``diverged`` as in `Scores`.
+    by block and ``nees_mean``, with the bounds of a block bootstrap: the NEES of one run is correlated in time. ``nis``,
+    ``whiteness`` and ``refused`` (readings that a gate refused) by sensor. ``diverged`` as `jaxfilt.metrics.diverged`
+    defines it.
     """
 
+    verdict: Verdict
     mean: PyTree
     std: np.ndarray
     info: dict[str, Info]
@@ -95,7 +98,7 @@ def replayed(
     compiled = time.perf_counter()
     out = jax.device_get(program(*arguments))
     done = time.perf_counter()
-    reviews = {name: _review(out[name], truth, blocks, replay.space.dim, lags, confidence) for name in filters}
+    reviews = {name: _review(name, out[name], truth, blocks, replay.space.dim, lags, confidence) for name in filters}
     return Replayed(
         reviews,
         np.asarray(replay.recording.t),
@@ -134,7 +137,9 @@ def _one(replay: Replay, filters: Filters, theta: PyTree, log: Log, known: PyTre
     return out
 
 
-def _review(seen: tuple, truth: Truth | None, blocks: Blocks, dim: int, lags: int, confidence: float) -> Review:
+def _review(
+    name: str, seen: tuple, truth: Truth | None, blocks: Blocks, dim: int, lags: int, confidence: float
+) -> Review:
     state, std, info, sound, error, nees = seen
     statuses = np.stack([i.status for i in info.values()], 1)
     bad = np.argwhere(statuses >= Status.BAD_BELIEF)
@@ -149,17 +154,21 @@ def _review(seen: tuple, truth: Truth | None, blocks: Blocks, dim: int, lags: in
         normal = nees[np.isfinite(nees)]
         last = normal[-1] if len(normal) else np.nan
         scores = anees_of_one_run(nees, dim, confidence)
+    nis = {sensor: metrics.anis(i, confidence) for sensor, i in info.items()}
+    white = {sensor: metrics.whiteness(i, lags, confidence) for sensor, i in info.items()}
+    refused = {sensor: int((i.status == Status.GATED).sum()) for sensor, i in info.items()}
     return Review(
-        state,
-        std,
-        info,
-        error,
-        nees,
-        None if error is None else metrics.rmse(error, blocks, np.isfinite(error).all(1)),
-        scores,
-        {name: metrics.anis(i, confidence) for name, i in info.items()},
-        {name: metrics.whiteness(i, lags, confidence) for name, i in info.items()},
-        {name: int((i.status == Status.GATED).sum()) for name, i in info.items()},
-        bool(metrics.diverged(last, sound.all() and fault is None, dim)),
-        fault,
+        verdict=innovation_verdict(nis, white, scores, confidence, name=name, refused=refused),
+        mean=state,
+        std=std,
+        info=info,
+        error=error,
+        nees=nees,
+        rmse=None if error is None else metrics.rmse(error, blocks, np.isfinite(error).all(1)),
+        nees_mean=scores,
+        nis=nis,
+        whiteness=white,
+        refused=refused,
+        diverged=bool(metrics.diverged(last, sound.all() and fault is None, dim)),
+        fault=fault,
     )

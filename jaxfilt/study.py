@@ -24,14 +24,16 @@ from jaxfilt.tally import every
 from jaxfilt.task import Filters, Options, Task, itself, seed, task_of
 from jaxfilt.totals import NOBODY, Totals
 from jaxfilt.types import Array, Gaussian, Log, Model, PyTree, Space, Status
+from jaxfilt.verdict import Verdict, verdicts
 
 
 class Study(NamedTuple):
     """What `study` returns: plain NumPy and numbers.
 
-    By filter: ``scores`` over all runs, as far as they are finite; ``kept`` over the runs that did not diverge (the
-    same where none did); ``diverged``; ``faults``, None where nothing went wrong; ``tracks``, the beliefs of the first
-    runs, leading axes (examples, T). ``paired``: by (filter, filter), their difference on the same noise.
+    By filter: ``verdicts`` in words; ``scores`` over all runs, as far as they are finite; ``kept`` over the runs that
+    did not diverge (the same where none did); ``diverged``; ``faults``, None where nothing went wrong; ``tracks``, the
+    beliefs of the first runs, leading axes (examples, T). ``paired``: by (filter, filter), their difference on the same
+    noise.
 
     ``truth`` (examples, T, ...) of the first runs. ``t`` (T,) s since the start. ``space`` and ``blocks`` of the
     filters' state. ``runs`` that were done, of ``planned``. ``seed`` makes the key again, ``jax.random.key(seed)``, for
@@ -39,6 +41,7 @@ class Study(NamedTuple):
     ``compile_seconds`` is near 0 where the program was there already.
     """
 
+    verdicts: dict[str, Verdict]
     scores: dict[str, Scores]
     kept: dict[str, Scores]
     diverged: dict[str, Diverged]
@@ -185,15 +188,20 @@ def conducted(
     task = task_of(model, filters, belief, log, key, settings, swept, options)
     outcome = run(task, options.out, options.resume, options.progress)
     totals = outcome.totals
+    t = np.cumsum(np.asarray(log.dt, np.float64))
     studies = []
     for i, (theta, truth_theta) in enumerate(settings):
         part = jax.tree.map(lambda a, i=i: a[i], totals._replace(done=())) if any(swept) else totals
+        found = _found(task, part)
+        about = {"blocks": task.blocks, "t": t, "confidence": task.confidence, "runs": int(totals.done)}
+        every_run, _, diverged, faults, _ = found
         studies.append(
             Study(
-                *_found(task, part),
+                verdicts(every_run, diverged, faults, **about),
+                *found,
                 truth=part.examples.truth,
                 tracks=part.examples.tracks,
-                t=np.cumsum(np.asarray(log.dt, np.float64)),
+                t=t,
                 space=task.space,
                 blocks=task.blocks,
                 theta=theta,
@@ -222,11 +230,12 @@ def _found(task: Task, totals: Totals) -> tuple:
     r = totals.records
     for f, name in enumerate(names):
         of = lambda a, f=f: a[f]  # noqa: E731
-        worst = {
-            block: Worst(float(np.sqrt(r.worst[f, k])), int(r.worst_run[f, k])) for k, block in enumerate(task.blocks)
-        }
         lost = totals.lost[:, f]
-        for into, sums, without in ((every_run, totals.all, False), (kept, totals.kept, True)):
+        for into, sums, square, run_of, without in (
+            (every_run, totals.all, r.worst[f], r.worst_run[f], False),
+            (kept, totals.kept, r.kept_worst[f], r.kept_worst_run[f], True),
+        ):
+            worst = {b: Worst(float(np.sqrt(square[k])), int(run_of[k])) for k, b in enumerate(task.blocks)}
             own = jax.tree.map(of, sums._replace(paired=()))
             nees = np.where(without & lost, np.nan, totals.nees[f])
             credible = _credible(totals.error[f], nees, own.outer, own.rows.number[:, 0], task.steps)

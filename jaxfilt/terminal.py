@@ -17,7 +17,7 @@ from jaxfilt.scores import STATE, Estimate
 from jaxfilt.study import Study
 from jaxfilt.sweep import Sweep
 from jaxfilt.types import Status
-from jaxfilt.verdict import Verdict, innovation_verdict, verdicts
+from jaxfilt.verdict import Verdict
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -101,8 +101,7 @@ def show_study(s: Study, title: str, bound: Bound | None) -> None:
         print(f"Cramer-Rao bound: {bound.kind}")
     for (a, b), pair in s.paired.items():
         _show_pair(s, a, b, pair)
-    spoken = verdicts(s.scores, s.diverged, s.faults, blocks=s.blocks, t=s.t, confidence=s.confidence, runs=s.runs)
-    for verdict in spoken.values():
+    for verdict in s.verdicts.values():
         _show_verdict(verdict)
 
 
@@ -152,8 +151,8 @@ def show_replay(r: Replayed, title: str, gated: bool) -> None:
     table.add_section()
     _row(table, "diverged", ["[red]yes[/]" if v.diverged else "no" for v in reviews])
     show(table)
-    for name, v in r.reviews.items():
-        _show_verdict(innovation_verdict(v.nis, v.whiteness, v.nees_mean, r.confidence, name=name, refused=v.refused))
+    for review in reviews:
+        _show_verdict(review.verdict)
 
 
 def _show_verdict(verdict: Verdict) -> None:

@@ -2,8 +2,10 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import jax
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxfilt as jf
-from jaxfilt import cli, files, scenarios
+from jaxfilt import arguments, cli, files, scenarios
 
 OWN = """
 import jax.numpy as jnp
@@ -111,24 +113,34 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    for word in ("RMSE position, m", "mean NEES (4)", "mean NIS gnss (2)", "diverged runs", "compile", "inside"):
+    for word in (
+        "RMSE position, m",
+        "mean NEES (4)",
+        "mean NIS gnss (2)",
+        "diverged runs",
+        "compile",
+        "inside",
+        "bound",
+    ):
         assert word in done.stdout
     out = tmp_path / "jaxfilt-out" / "study-car"
     assert is_picture(out / "study.png")
     found = summary(out)
-    assert found["schema"] == "jaxfilt.study/1"
-    assert found["name"] == "car"
+    assert found["schema"] == "jaxfilt.study/2"
+    assert (found["name"], found["complete"]) == ("car", True)
+    assert found["command"].startswith("jaxfilt ")
     settings = found["settings"]
     assert (settings["runs"], settings["steps"], settings["seed"], settings["dtype"]) == (20, 40, 3, "float64")
-    assert settings["theta"]["gnss"] == pytest.approx(0.0)
-    assert set(found["filters"]) == {"ekf", "ukf"}
-    ekf = found["filters"]["ekf"]
-    assert ekf["rmse"]["position"]["unit"] == "m"
-    assert 0.1 < ekf["rmse"]["position"]["value"] < 5
-    assert ekf["nees"]["verdict"] in ("inside", "above", "below")
-    assert len(ekf["over_time"]["nees"]["mean"]) == len(ekf["over_time"]["t"]) == 40
-    assert ekf["over_time"]["nis"]["gnss"]["mean"][0] is None
+    assert settings["theta"]["robot/gnss"] == settings["truth_theta"]["gnss"] == pytest.approx(0.0)
+    assert set(found["filters"]) == set(found["verdicts"]) == {"ekf", "ukf"}
+    assert found["verdicts"]["ekf"]["headline"] in done.stdout
+    position = found["filters"]["ekf"]["blocks"]["position"]
+    assert position["unit"] == "m"
+    assert 0.1 < position["rmse"]["value"] < 5
+    assert 0.3 < position["efficiency"] < 1.5
+    assert found["bound"]["exact"] is True
     assert found["made_with"]["jax"] == jax.__version__
+    assert "<html" in (out / "report.html").read_text()
 
 
 def test_a_users_own_scenario_and_recording(folder):
@@ -136,9 +148,9 @@ def test_a_users_own_scenario_and_recording(folder):
     printed = invoke("study", "my.py:made", "--filter", "kf", "--runs", "50", "--steps", "30", "--out", "here")
     assert re.search(r"RMSE place, m +0\.\d+", printed)
     assert is_picture(folder / "here" / "study.png")
-    assert summary(folder / "here")["filters"]["kf"]["nis"]["z"]["verdict"] == "inside"
+    assert summary(folder / "here")["filters"]["kf"]["sensors"]["z"]["nis"]["verdict"] == "inside"
 
-    car = cli._own_scenario("my.py:car")[0]
+    car = arguments._own_scenario("my.py:car")[0]
     _, log = jf.simulate(car.model(car.theta), car.belief(car.theta), car.schedule(100), jax.random.key(0))
     files.save("log.npz", jf.Recording(jax.tree.map(np.asarray, log), 0.1 * np.arange(100)))
     printed = invoke("replay", "my.py:car", "log.npz", "--filter", "kf", "--gate", "0.9")
@@ -147,11 +159,66 @@ def test_a_users_own_scenario_and_recording(folder):
     out = folder / "jaxfilt-out" / "replay-my-car-log"
     assert is_picture(out / "replay.png")
     found = summary(out)
-    assert found["schema"] == "jaxfilt.replay/1"
+    assert found["schema"] == "jaxfilt.replay/2"
     kf = found["filters"]["kf"]
-    assert kf["nees"] is None
-    assert 0 < kf["nis"]["z"]["refused"] < 30
-    assert len(kf["whiteness"]["z"]["lags"]) == 20
+    assert kf["state"] is None
+    assert 0 < kf["sensors"]["z"]["refused"] < 30
+    assert len(kf["sensors"]["z"]["whiteness"]["lags"]) == 20
+    assert found["verdicts"]["kf"]["headline"] in " ".join(printed.split())
+
+
+QUICK = ["--filter", "kf", "--runs", "200", "--steps", "60", "--no-bound"]
+
+
+def test_what_the_filters_assume_wrongly_is_found(folder):
+    assert "kf consistent" in invoke("study", "my.py:car", *QUICK, "--out", "right")
+    printed = invoke("study", "my.py:car", *QUICK, "--assume", "R/z=0.25", "--assume", "Q=0.25", "--out", "wrong")
+    assert "overconfident in place: ANEES 4.0 x expected throughout" in printed
+    settings = summary(folder / "wrong")["settings"]
+    assert (settings["theta"]["assumed/Q"], settings["theta"]["assumed/R/z"]) == (0.25, 0.25)
+    assert summary(folder / "wrong")["verdicts"]["kf"]["consistent"] is False
+
+
+def test_a_sweep_is_a_table_and_a_picture(folder):
+    printed = invoke("study", "my.py:car", *QUICK, "--sweep", "Q=0.1,1,10", "--sweep", "R=1,4", "--out", "grid")
+    rows = re.findall(r"Q=([\d.]+), R=([\d.]+) +([\d.]+) +([\d.]+)", printed)
+    assert [row[:2] for row in rows] == [(q, r) for q in ("0.1", "1", "10") for r in ("1", "4")]
+    assert min(rows, key=lambda row: float(row[2]))[:2] == ("1", "1")
+    assert float(rows[0][3]) > 1.2 > float(rows[2][3]) > 0.8
+    found = summary(folder / "grid")
+    assert found["schema"] == "jaxfilt.sweep/1"
+    assert found["over"] == {"Q": [0.1, 1.0, 10.0], "R": [1.0, 4.0]}
+    assert is_picture(folder / "grid" / "sweep.png")
+
+
+def test_readings_can_be_spoiled(folder):
+    struck = invoke("study", "my.py:car", *QUICK, "--corrupt", "outliers:z:0.1:20", "--corrupt", "drop-outs:z:0.5:3")
+    assert "innovations of z larger than claimed" in struck
+    assert "kf consistent" not in struck
+
+
+def test_ctrl_c_leaves_a_valid_result_and_says_how_to_go_on(folder):
+    """A real SIGINT, to a process that has begun to run; then the same command with --resume."""
+    command = [sys.executable, "-c", "from jaxfilt.cli import main; main()", "study", "my.py:car"]
+    command += ["--filter", "kf", "--runs", "4000", "--steps", "50", "--chunk", "2", "--no-bound", "--out", "out"]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while running.poll() is None and not (folder / "out" / "checkpoint.npz").exists():
+        time.sleep(0.01)
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=120)
+    assert running.returncode == 130, err
+    assert re.search(r"interrupted after [\d,]+ of 4,000 runs; go on with: jaxfilt study .* --resume", err)
+    partial = summary(folder / "out")
+    assert partial["complete"] is False
+    assert 0 < partial["settings"]["runs"] < 4000
+    assert "RMSE place, m" in out
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert again.returncode == 2
+    assert "4,000 runs: resume it, or remove the folder to begin anew; go on with: jaxfilt" in again.stderr
+    resumed = subprocess.run([*command, "--resume"], capture_output=True, text=True)
+    assert resumed.returncode == 0, resumed.stderr
+    assert summary(folder / "out")["complete"] is True
+    assert summary(folder / "out")["settings"]["runs"] == 4000
 
 
 def test_single_precision_is_there_to_ask_for(folder):
@@ -165,7 +232,7 @@ def test_a_recorded_drive(folder):
     printed = invoke("replay", "wifibot", "--filter", "ekf", "--out", "out")
     assert "RMSE position, m" in printed
     found = summary(folder / "out")
-    assert found["filters"]["ekf"]["rmse"]["position"]["value"] < 0.1
+    assert found["filters"]["ekf"]["blocks"]["position"]["rmse"] < 0.1
     assert is_picture(folder / "out" / "replay.png")
 
 
@@ -175,7 +242,17 @@ def test_lists_help_and_version():
         assert name in listed
     assert "utias_mrclam" in invoke("replay", "--list")
     shown = invoke("study", "--help")
-    for option in ("--filter", "--runs", "--steps", "--seed", "--dtype", "--out"):
+    for option in (
+        "--filter",
+        "--runs",
+        "--steps",
+        "--seed",
+        "--assume",
+        "--sweep",
+        "--corrupt",
+        "--dtype",
+        "--resume",
+    ):
         assert option in shown
     assert f"jax {jax.__version__}" in invoke("--version")
 
@@ -199,6 +276,15 @@ def test_every_scenario_of_the_list_can_be_built_and_says_what_it_is():
         (["study", "car", "--runs", "many"], "Invalid value for '--runs'"),
         (["study", "car", "--dtype", "float16"], "--dtype: expected float64 or float32, got 'float16'"),
         (["study", "car", "--bogus"], "No such option: --bogus"),
+        (["study", "car", "--assume", "Q=-1"], "--assume: expected Q=FACTOR, R=FACTOR or R/SENSOR=FACTOR, got 'Q=-1'"),
+        (["study", "car", "--sweep", "S=1,2"], "--sweep: expected Q=FACTOR, R=FACTOR or R/SENSOR=FACTOR, got 'S=1,2'"),
+        (["study", "car", "--assume", "R/sonar=2"], "R/sonar: expected a sensor of gnss, odometer, mark"),
+        (
+            ["study", "car", "--corrupt", "rain:gnss"],
+            "--corrupt: expected one of outliers, heavy-tails, drop-outs, delay",
+        ),
+        (["study", "car", "--corrupt", "outliers:gnss:2:3"], "--corrupt: expected outliers:SENSOR:PROBABILITY:SCALE"),
+        (["study", "my.py:car", "--resume", "--out", "new"], "new: expected a study to resume, found none"),
         (["fly"], "No such command 'fly'"),
         (["study", "car", "--out", "my.py/out"], "--out: cannot make the folder my.py/out: Not a directory"),
         (["study", "their.py:car"], "their.py:car: there is no file their.py"),
