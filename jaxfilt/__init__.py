@@ -1,5 +1,6 @@
 """jaxfilt: differentiable, batched Kalman filters in JAX."""
 
+from jaxfilt.arrays import to_xarray
 from jaxfilt.bootstrap import block_bootstrap
 from jaxfilt.bound import Bound, cramer_rao, efficiency
 from jaxfilt.check import Checkup, check
@@ -122,6 +123,7 @@ __all__ = [
     "study",
     "sweep",
     "taylor",
+    "to_xarray",
     "ukf",
     "unscented",
     "validate",
