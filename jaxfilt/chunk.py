@@ -207,7 +207,7 @@ def _chunk(
     space, dtype = next(iter(bank.values())).model.space, origin.cov.dtype
     corrupt = None if plan.corrupt is None else plan.corrupt(truth_theta)
     sensors = [name for name in robot.sensors if name in log.z]
-    place = columns(space.dim, len(plan.blocks), sensors)
+    place = columns(space.dim, len(plan.blocks), sorted(sensors))  # as JAX sorts a dict's keys
 
     def shown(tree: PyTree) -> PyTree:
         return jax.tree.map(lambda a: jax.lax.all_gather(a, "runs")[: plan.examples], tree)
@@ -216,7 +216,8 @@ def _chunk(
         own = jax.random.fold_in(jax.random.wrap_key_data(key, impl=plan.generator), number)
         truth, readings = simulate(robot, origin, log, own, plan.control)
         if corrupt is not None:
-            readings = corrupt(truth, readings, jax.random.fold_in(own, 1))
+            # Not fold_in(own, 1): that is the second key of split(own), with which the simulation draws its noises.
+            readings = corrupt(truth, readings, jax.random.fold_in(own, 2))
         truth = jax.vmap(plan.view)(truth)
 
         def body(carry: tuple, row: tuple[Log, PyTree]) -> tuple:
@@ -231,14 +232,13 @@ def _chunk(
             values, white = jax.vmap(functools.partial(score, plan.blocks))(error, cov, info)
             there = jnp.isfinite(values) & weight[:, None]
             sums = jax.lax.psum(moments(values[None], there[None], 0), "runs")
-            codes = jnp.stack([i.status for i in info.values()], 1)
+            codes = jnp.stack([info[name].status for name in sensors], 1)
             sound = jnp.isfinite(error).all(1) & jnp.isfinite(cov).all((1, 2))
             told = _told(told, values, there, sound, codes, values[:, place["square"]])
             keep = {name: values[:, place[name]] for name in ("error", "normalised", "nees")}
-            white |= {f"dof {name}": jnp.sqrt(values[:, place[f"dof {name}"]]) for name in sensors}
             return (beliefs, told), (sums, keep, white, shown(beliefs))
 
-        F, K = len(bank), place["covered"].stop if not sensors else place[f"refused {sensors[-1]}"].stop
+        F, K = len(bank), max(at.stop for at in place.values())
         number_of = lambda *shape: jnp.zeros((F, *shape), dtype)  # noqa: E731
         none = jnp.full(F, NO_FAULT)
         told = _Carried(
@@ -270,8 +270,8 @@ def _chunk(
         run_nees=jax.vmap(histogram, in_axes=(0, 0, None))(
             averages[..., place["nees"].start] / space.dim, by_filter, NEES_EDGES
         ),
-        dots={name: lag[name] for name in sensors},
-        pairs={name: lag[f"dof {name}"] for name in sensors},
+        dots={name: dots for name, (dots, _) in lag.items()},
+        pairs={name: pairs for name, (_, pairs) in lag.items()},
         paired=moments(differences, jnp.isfinite(differences), 1),
     )
     some = slice(every(len(log.dt)) - 1, None, every(len(log.dt)))
@@ -286,7 +286,7 @@ def _told(told: _Carried, values: Array, there: Array, sound: Array, codes: Arra
     return _Carried(
         row=told.row + 1,
         total=told.total + jnp.where(there, values, 0.0),
-        count=told.count + there,
+        count=told.count + there.astype(told.count.dtype),
         sound=told.sound & sound,
         fault=jnp.where(new, told.row * codes.shape[1] + sensor, told.fault),
         status=jnp.where(new, jnp.take_along_axis(codes, sensor[:, None], 1)[:, 0], told.status),
@@ -300,10 +300,10 @@ def _outer(error: Array) -> jax.Array:
     return jnp.einsum("ftri,ftrj->ftij", error, error)
 
 
-def _lagged(white: Array, log: Log, name: str, lags: int) -> jax.Array:
-    """By filter (F, L) sums over all runs of products of (T, R, F, m); lags count the readings of the schedule."""
+def _lagged(white: Array, log: Log, name: str, lags: int) -> tuple[jax.Array, jax.Array]:
+    """By filter (F, L), of (T, R, F, m): see `lagged`, over all runs; lags count the readings of the schedule."""
     order = jnp.arange(len(log.dt))
-    valid = log.valid.get(name.removeprefix("dof "))
+    valid = log.valid.get(name)
     if valid is not None:
         order = jnp.argsort(~jnp.asarray(valid).reshape(len(order), -1).any(1), stable=True)
     return jax.vmap(lagged, in_axes=(2, None, None))(white, order, lags)

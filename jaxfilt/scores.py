@@ -125,7 +125,7 @@ def scores(
         worst: the largest errors, which are no sums.
         credible: noncredibility index and inclination (T,).
     """
-    sensors, names = list(sums.dots), list(blocks)
+    sensors, names = sorted(sums.dots), list(blocks)
     place = columns(dim, len(blocks), sensors)
     row = {name: Moments(*(a[:, at] for a in sums.rows)) for name, at in place.items()}
     whole = {name: Moments(*(a[at] for a in sums.averages)) for name, at in place.items()}

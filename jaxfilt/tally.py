@@ -94,7 +94,7 @@ def score(blocks: Blocks, error: Array, cov: Array, info: dict[str, Info]) -> tu
     white = {}
     for name, i in info.items():
         nis, dof = metrics.used(i)
-        marks = jnp.stack([dof, dof > 0, i.status == Status.GATED]).astype(error.dtype)
+        marks = jnp.stack([a.astype(error.dtype) for a in (dof, dof > 0, i.status == Status.GATED)])
         values += [nis[None], marks]
         S = jnp.where(dof > 0, i.S, jnp.eye(len(i.S), dtype=i.S.dtype))  # where it was silent S is 0: no root
         whitened = linalg.forward_solve(linalg.cholesky(S), i.innovation)
@@ -110,7 +110,8 @@ def moments(values: Array, there: Array, axis: int) -> Moments:
 
 def histogram(values: Array, there: Array, edges: np.ndarray) -> jax.Array:
     """Counts (bins,) between the edges; what is beyond them falls into the outermost bins."""
-    below = (values[..., None] < jnp.asarray(edges[1:-1], values.dtype)) & there[..., None]
+    inner = jnp.asarray(edges[1:-1], values.dtype).reshape((1,) * values.ndim + (-1,))
+    below = (values[..., None] < inner) & there[..., None]
     cumulative = below.reshape(-1, len(edges) - 2).sum(0)
     return jnp.diff(cumulative, prepend=0, append=there.sum())
 
@@ -124,12 +125,19 @@ def error_histogram(normalised: Array, weights: Array) -> jax.Array:
     """Counts (n, bins) of the normalised errors (T, R, n) of runs with weights (R,) True, at some rows."""
     step = every(len(normalised))
     some = jnp.moveaxis(normalised[step - 1 :: step], -1, 0)
-    return jax.vmap(histogram, in_axes=(0, 0, None))(some, jnp.isfinite(some) & weights, ERROR_EDGES)
+    return jax.vmap(histogram, in_axes=(0, 0, None))(some, jnp.isfinite(some) & weights[None, None], ERROR_EDGES)
 
 
-def lagged(white: Array, order: Array, lags: int) -> jax.Array:
-    """Sums (lags,) of the products of normalised innovations (T, R, m) that are 1, 2, ... readings apart."""
+def lagged(white: Array, order: Array, lags: int) -> tuple[jax.Array, jax.Array]:
+    """Of normalised innovations (T, R, m) that are 1, 2, ... readings apart: sums (lags,) of products, their number.
+
+    What was not used is exactly 0 in ``white``, and what was used never is: the noise is continuous.
+    """
     ordered = white[order]
     later = jnp.concatenate([ordered, jnp.zeros((lags, *ordered.shape[1:]), ordered.dtype)])
-    at = lambda lag: (ordered * jax.lax.dynamic_slice_in_dim(later, lag, len(ordered))).sum()  # noqa: E731
+
+    def at(lag: Array) -> tuple[jax.Array, jax.Array]:
+        product = ordered * jax.lax.dynamic_slice_in_dim(later, lag, len(ordered))
+        return product.sum(), (product != 0).sum()
+
     return jax.lax.map(at, jnp.arange(1, lags + 1))

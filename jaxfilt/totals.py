@@ -23,7 +23,7 @@ class Records(NamedTuple):
 
     How many runs ``diverged`` and the first of them, ``named`` (F, `NAMED`); how many were ``faulty``, and the earliest
     ``fault`` (see `jaxfilt.chunk.Each`), the first run that has it and its status; the ``worst`` (F, B) squared error
-    by block, and the run that made it.
+    by block, and the run that made it, of all runs and of those that did not diverge.
     """
 
     diverged: Array
@@ -34,6 +34,8 @@ class Records(NamedTuple):
     status: Array
     worst: Array
     worst_run: Array
+    kept_worst: Array
+    kept_worst_run: Array
 
 
 class Totals(NamedTuple):
@@ -92,7 +94,8 @@ def _records(each: Each, numbers: np.ndarray, counts: np.ndarray) -> Records:
     worst = each.worst[..., counts, :, :]
     none = np.iinfo(np.int32).max
     named = np.sort(np.where(np.moveaxis(diverged, -2, -1), runs, NOBODY), -1)[..., :NAMED]
-    first, largest = fault.argmin(-2), worst.argmax(-3)
+    kept_worst = np.where(diverged[..., None], 0.0, worst)
+    first = fault.argmin(-2)
     return Records(
         diverged=diverged.sum(-2),
         named=np.pad(named, [(0, 0)] * (named.ndim - 1) + [(0, NAMED - named.shape[-1])], constant_values=NOBODY),
@@ -101,12 +104,14 @@ def _records(each: Each, numbers: np.ndarray, counts: np.ndarray) -> Records:
         fault_run=runs[first],
         status=np.take_along_axis(status, first[..., None, :], -2)[..., 0, :],
         worst=worst.max(-3),
-        worst_run=runs[largest],
+        worst_run=runs[worst.argmax(-3)],
+        kept_worst=kept_worst.max(-3),
+        kept_worst_run=runs[kept_worst.argmax(-3)],
     )
 
 
 def _compared(a: Records, b: Records) -> Records:
-    sooner, larger = b.fault < a.fault, b.worst > a.worst
+    sooner, larger, kept_larger = b.fault < a.fault, b.worst > a.worst, b.kept_worst > a.kept_worst
     return Records(
         diverged=a.diverged + b.diverged,
         named=np.sort(np.concatenate([a.named, b.named], -1), -1)[..., :NAMED],
@@ -116,4 +121,6 @@ def _compared(a: Records, b: Records) -> Records:
         status=np.where(sooner, b.status, a.status),
         worst=np.where(larger, b.worst, a.worst),
         worst_run=np.where(larger, b.worst_run, a.worst_run),
+        kept_worst=np.where(kept_larger, b.kept_worst, a.kept_worst),
+        kept_worst_run=np.where(kept_larger, b.kept_worst_run, a.kept_worst_run),
     )
