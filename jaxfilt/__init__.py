@@ -1,6 +1,5 @@
 """jaxfilt: differentiable, batched Kalman filters in JAX."""
 
-from jaxfilt.arrays import to_xarray
 from jaxfilt.bootstrap import block_bootstrap
 from jaxfilt.bound import Bound, cramer_rao, efficiency
 from jaxfilt.check import Checkup, check
@@ -14,6 +13,7 @@ from jaxfilt.mismatch import scaled
 from jaxfilt.models.linear import linear
 from jaxfilt.models.sensors import range_bearing
 from jaxfilt.noise import Parametrisation, blocks, const, diagonal, log_cholesky, log_std, van_loan, white
+from jaxfilt.report.arrays import to_xarray
 from jaxfilt.review import Replayed, Review, replayed
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
 from jaxfilt.scores import Paired, Scores

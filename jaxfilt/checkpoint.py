@@ -82,7 +82,7 @@ def begin(folder: Path, about: dict[str, Any], runs: int, resume: bool = False) 
             "resume it, or remove the folder to begin anew"
         )
     (folder / STATE_FILE).unlink(missing_ok=True)
-    _write(folder / MANIFEST_FILE, _json(checkpoint.manifest | {"runs_done": 0}))
+    write_whole(folder / MANIFEST_FILE, _json(checkpoint.manifest | {"runs_done": 0}))
     return checkpoint
 
 
@@ -105,8 +105,8 @@ def save(checkpoint: Checkpoint, state: PyTree, done: int) -> None:
     manifest = json.dumps(checkpoint.manifest | {"runs_done": done})
     np.savez(buffer, manifest=np.array(manifest), **{str(i): a for i, a in enumerate(jax.tree.leaves(state))})
     try:
-        _write(checkpoint.folder / STATE_FILE, buffer.getvalue())
-        _write(checkpoint.folder / MANIFEST_FILE, _json(checkpoint.manifest | {"runs_done": done}))
+        write_whole(checkpoint.folder / STATE_FILE, buffer.getvalue())
+        write_whole(checkpoint.folder / MANIFEST_FILE, _json(checkpoint.manifest | {"runs_done": done}))
     except OSError as error:
         raise OSError(
             error.errno,
@@ -151,7 +151,8 @@ def _json(what: dict[str, Any]) -> bytes:
     return (json.dumps(what, indent=1) + "\n").encode()
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes) -> None:
+    """Put a file in place in one step: it is there whole, or as it was before."""
     partial = path.with_name(path.name + ".partial")
     try:
         with open(partial, "wb") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 from collections.abc import Callable
@@ -89,7 +90,7 @@ class Program(NamedTuple):
     With a sweep the weights are (settings, R, F). ``digest`` tells programs apart, also between processes.
     """
 
-    call: Callable[..., Chunk]
+    call: jax.stages.Compiled
     digest: str
 
 
@@ -106,18 +107,23 @@ def compiled(plan: Plan, devices: tuple, structure: Any, leaves: tuple) -> Progr
 
     On one device it is called with NumPy arrays; on several, which share the runs evenly, with those of `placed`.
     """
-    local, options = functools.partial(_settings, plan), {}
-    if len(devices) > 1:
+    local = functools.partial(_settings, plan)
+    if len(devices) == 1:
+        jitted = jax.jit(local)
+    else:
         mesh, specs = _mesh(devices), _specs(plan)
         lead = functools.partial(jax.tree.map, lambda a: a[None])
         parts = shard_map(lambda *a: lead(local(*a)), mesh, specs, PartitionSpec("runs"))
-        options["in_shardings"] = tuple(NamedSharding(mesh, spec) for spec in specs)
-        options["out_shardings"] = NamedSharding(mesh, PartitionSpec())
-    program = local if len(devices) == 1 else lambda *a: _joined(plan, parts(*a))
-    lowered = jax.jit(program, **options).lower(*structure.unflatten(leaves))
-    on_cpu = devices[0].platform == "cpu"
-    call = lowered.compile(compiler_options=CPU_OPTIONS if on_cpu else None)
-    return Program(call, hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16])
+        inward = tuple(NamedSharding(mesh, spec) for spec in specs)
+        everywhere = NamedSharding(mesh, PartitionSpec())
+        jitted = jax.jit(lambda *a: _joined(plan, parts(*a)), in_shardings=inward, out_shardings=everywhere)
+    lowered = jitted.lower(*structure.unflatten(leaves))
+    digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
+    device: Any = devices[0]
+    if device.platform == "cpu":
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # an XLA that does not know the option
+            return Program(lowered.compile(compiler_options=CPU_OPTIONS), digest)
+    return Program(lowered.compile(), digest)
 
 
 def placed(plan: Plan, devices: tuple, arguments: tuple) -> tuple:

@@ -15,9 +15,10 @@ from jaxfilt import arguments as asked
 from jaxfilt import checkpoint, datasets, recordings, report, scenarios, terminal
 from jaxfilt.arguments import Mistake, explained
 from jaxfilt.bound import Bound, cramer_rao
-from jaxfilt.review import replayed
-from jaxfilt.study import Interrupted
+from jaxfilt.review import Replayed, replayed
+from jaxfilt.study import Interrupted, Study
 from jaxfilt.study import study as monte_carlo
+from jaxfilt.sweep import Sweep
 from jaxfilt.sweep import sweep as many_studies
 from jaxfilt.types import Filter, Gaussian, Model, PyTree
 
@@ -128,27 +129,14 @@ def study(
         asked.rescaled(chosen.model(chosen.theta), believed | dict.fromkeys(over, 1.0))
         options |= {"progress": progress, "corrupt": asked.corruption(corrupt or [], chosen.model, chosen.theta)}
         robot = chosen.model, bank, functools.partial(_believed, chosen.belief), log, key
-        try:
-            if over:
-                theta = lambda **factors: {"robot": chosen.theta, "assumed": believed | factors}  # noqa: E731
-                result = many_studies(*robot, over, theta=theta, truth_theta=chosen.theta, **options)
-            else:
-                theta = {"robot": chosen.theta, "assumed": believed}
-                result = monte_carlo(*robot, theta=theta, truth_theta=chosen.theta, **options)
-            interrupted = False
-        except Interrupted as stopped:
-            result, interrupted = stopped.result, True
-        except (OSError, ValueError) as error:
-            if isinstance(error, ValueError) and "cannot resume" not in str(error):
-                raise
-            raise Mistake(_kept(error)) from None
+        result, interrupted = _simulated(robot, chosen.theta, believed, over, options)
         if bound and not over and not corrupt and not interrupted:
             limit = cramer_rao(
                 chosen.model, chosen.belief, log, key, theta=chosen.theta, runs=BOUND_RUNS, control=chosen.control
             )
-    done = result.runs if not over else result.studies.flat[0].runs
+    done = _one_of(result).runs
     title = f"{label}: {done:,} runs of {steps:,} steps, {dtype}, seed {seed}"
-    if over:
+    if isinstance(result, Sweep):
         terminal.show_sweep(result, title)
     else:
         terminal.show_study(result, title, limit)
@@ -156,6 +144,28 @@ def study(
     if interrupted:
         print(f"interrupted after {done:,} of {runs:,} runs; go on with: {_command()} --resume", file=sys.stderr)
     return 130 if interrupted else 0
+
+
+def _simulated(
+    robot: tuple, theta: PyTree, believed: dict[str, float], over: dict[str, list[float]], options: dict[str, Any]
+) -> tuple[Study | Sweep, bool]:
+    """The study, or the sweep of studies, and whether it was interrupted."""
+
+    def assumed(**factors: float) -> PyTree:
+        return {"robot": theta, "assumed": believed | factors}
+
+    try:
+        if over:
+            return many_studies(*robot, over=over, theta=assumed, truth_theta=theta, **options), False
+        return monte_carlo(*robot, theta=assumed(), truth_theta=theta, **options), False
+    except Interrupted as stopped:
+        return stopped.result, True
+    except OSError as error:
+        raise Mistake(_kept(error)) from None
+    except ValueError as error:
+        if "cannot resume" not in str(error):
+            raise
+        raise Mistake(asked.line(error)) from None
 
 
 def replay(
@@ -202,13 +212,11 @@ def _built(make: Callable[..., Filter], model: Callable[[PyTree], Model], gate: 
     return make(model(theta), gate=gate)
 
 
-def _kept(error: Exception) -> str:
-    """What hinders a study from keeping its state, or from going on with one."""
+def _kept(error: OSError) -> str:
+    """What hinders a study from keeping its state."""
     if isinstance(error, FileExistsError):
         return f"{error}; go on with: {_command()} --resume"
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return asked.line(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else asked.line(error)
 
 
 def _command() -> str:
@@ -216,15 +224,19 @@ def _command() -> str:
     return shlex.join(["jaxfilt", *[word for word in sys.argv[1:] if word != "--resume"]])
 
 
-def _finish(result: Any, folder: Path, label: str, bound: Bound | None) -> None:
+def _one_of(result: Study | Sweep | Replayed) -> Any:
+    """The result, or the first study of a sweep: how long it took, and of how many runs it is, all share."""
+    return result.studies.flat[0] if isinstance(result, Sweep) else result
+
+
+def _finish(result: Study | Sweep | Replayed, folder: Path, label: str, bound: Bound | None) -> None:
     try:
         report.write(result, folder, label, bound=bound, command=_command())
     except ModuleNotFoundError as missing:
         raise Mistake(asked.line(missing)) from None
     except OSError as error:
         raise Mistake(f"{folder}: cannot write the results: {error.strerror}") from None
-    timed = getattr(result, "studies", None)
-    timed = result if timed is None else timed.flat[0]
+    timed = _one_of(result)
     print(
         f"compile {timed.compile_seconds:.1f} s, run {timed.run_seconds:.1f} s; "
         f"bounds hold {100 * timed.confidence:g} % of the time"

@@ -26,7 +26,7 @@ class Review(NamedTuple):
 
     ``mean`` (T, ...) the part of the state that the truth knows, ``std`` (T, d) of its tangent, ``info`` sensor ->
     `Info`, leading axis T. With a truth, else None: ``error`` (T, d), NaN where it is unknown, ``nees`` (T,), ``rmse``
-    by block and ``nees_mean``, with the bounds of a block bootstrap: the NEES of one run is correlated in time. ``nis``,
+    by block and ``nees_mean``, with bounds of a block bootstrap: the NEES of one run is correlated in time. ``nis``,
     ``whiteness`` and ``refused`` (readings that a gate refused) by sensor. ``diverged`` as `jaxfilt.metrics.diverged`
     defines it.
     """

@@ -22,8 +22,6 @@ FLOORS = [
     {"campaign", "review"},
     {"study"},
     {"sweep"},
-    {"arrays", "figures"},
-    {"page"},
     {"report"},
     {"arguments", "terminal"},
     {"cli"},

@@ -73,4 +73,4 @@ def growth_scenario() -> Scenario:
     def grow(steps: int) -> Log:
         return schedule(growth(), steps, 1.0, u=np.cos(1.2 * np.arange(steps)))
 
-    return Scenario(growth, growth_start, GROWTH, grow, {"state": ((0,), "1")})
+    return Scenario(growth, growth_start, GROWTH, grow, {"x": ((0,), "1")})
