@@ -19,6 +19,7 @@ from jaxfilt.simulate import simulate
 from jaxfilt.tally import (
     NEES_EDGES,
     Blocks,
+    Moments,
     Sums,
     columns,
     error_histogram,
@@ -260,28 +261,35 @@ def _chunk(
     rows, examples, told, (keep, white) = jax.vmap(one, axis_name="runs", out_axes=out_axes)(numbers, weights)
     lost = (keep["nees"][-1, :, :, 0] > plan.limit) | ~told.sound | (told.fault != NO_FAULT)
     each = Each(lost, told.fault, told.status, told.worst)
+    error, nees = (jnp.moveaxis(keep[name], 2, 0) for name in ("error", "nees"))
     averages = jnp.moveaxis(told.total / told.count, 1, 0)
     by_filter = jnp.moveaxis(weights, 1, 0)
-    a, b = np.triu_indices(len(bank), 1)
-    compared = jnp.concatenate([averages[..., place["square"]], averages[..., place["log_score"]]], -1)
-    differences = compared[a] - compared[b]
     lag = {name: _lagged(jnp.where(weights[..., None], w, 0.0), log, name, plan.lags) for name, w in white.items()}
-    error, nees = (jnp.moveaxis(keep[name], 2, 0) for name in ("error", "nees"))
     sums = Sums(
         runs=by_filter.sum(1),
         rows=jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), rows),
         averages=moments(averages, jnp.isfinite(averages), 1),
         outer=_outer(jnp.where(by_filter[:, None, :, None], error, 0.0)),
         errors=jax.vmap(error_histogram, in_axes=(2, 1))(keep["normalised"], weights),
-        run_nees=jax.vmap(histogram, in_axes=(0, 0, None))(
-            averages[..., place["nees"].start] / space.dim, by_filter, NEES_EDGES
-        ),
+        run_nees=_spread(averages[..., place["nees"].start] / space.dim, by_filter),
         dots={name: dots for name, (dots, _) in lag.items()},
         pairs={name: pairs for name, (_, pairs) in lag.items()},
-        paired=moments(differences, jnp.isfinite(differences), 1),
+        paired=_paired(jnp.concatenate([averages[..., place["square"]], averages[..., place["log_score"]]], -1)),
     )
     some = slice(every(len(log.dt)) - 1, None, every(len(log.dt)))
     return Chunk(sums, each, error[:, some, : plan.sample], nees[:, some, : plan.sample, 0], examples)
+
+
+def _paired(averages: Array) -> Moments:
+    """Over the runs that neither of two filters lost, the differences of their averages (F, R, k), by pair."""
+    a, b = np.triu_indices(len(averages), 1)
+    differences = averages[a] - averages[b]
+    return moments(differences, jnp.isfinite(differences), 1)
+
+
+def _spread(nees: Array, by_filter: Array) -> jax.Array:
+    """By filter, counts (F, bins) of the runs' average NEES (F, R) over n."""
+    return jax.vmap(histogram, in_axes=(0, 0, None))(nees, by_filter, NEES_EDGES)
 
 
 def _told(told: _Carried, values: Array, there: Array, sound: Array, codes: Array, square: Array) -> _Carried:

@@ -20,9 +20,9 @@ from jaxfilt.credibility import noncredibility
 from jaxfilt.metrics import Blocks
 from jaxfilt.mismatch import Corruption
 from jaxfilt.scores import Diverged, Fault, Paired, Scores, Worst, paired, scores
-from jaxfilt.tally import every
+from jaxfilt.tally import Sums, every
 from jaxfilt.task import Filters, Options, Task, itself, seed, task_of
-from jaxfilt.totals import NOBODY, Totals
+from jaxfilt.totals import NOBODY, Records, Totals
 from jaxfilt.types import Array, Gaussian, Log, Model, PyTree, Space, Status
 from jaxfilt.verdict import Verdict, verdicts
 
@@ -193,14 +193,14 @@ def conducted(
     for i, (theta, truth_theta) in enumerate(settings):
         part = jax.tree.map(lambda a, i=i: a[i], totals._replace(done=())) if any(swept) else totals
         found = _found(task, part)
-        about = {"blocks": task.blocks, "t": t, "confidence": task.confidence, "runs": int(totals.done)}
-        every_run, _, diverged, faults, _ = found
+        judged = {name: found[name] for name in ("scores", "diverged", "faults")}
+        words = verdicts(**judged, blocks=task.blocks, t=t, confidence=task.confidence, runs=int(totals.done))
         studies.append(
             Study(
-                verdicts(every_run, diverged, faults, **about),
-                *found,
+                verdicts=words,
+                **found,
                 truth=part.examples.truth,
-                tracks=part.examples.tracks,
+                tracks={name: part.examples.tracks[name] for name in filters},  # in their order, which JAX sorted
                 t=t,
                 space=task.space,
                 blocks=task.blocks,
@@ -223,32 +223,31 @@ def conducted(
     return studies, outcome.interrupted
 
 
-def _found(task: Task, totals: Totals) -> tuple:
-    """By filter: scores, kept, diverged, faults; and by two filters, paired."""
-    names, dim = [name for name, _ in task.plan.filters], task.space.dim
-    every_run, kept, diverged, faults = {}, {}, {}, {}
-    r = totals.records
+def _found(task: Task, totals: Totals) -> dict[str, dict]:
+    """The fields of `Study` that the totals of one setting hold."""
+    names, r = [name for name, _ in task.plan.filters], totals.records
+    found: dict[str, dict] = {"scores": {}, "kept": {}, "diverged": {}, "faults": {}, "paired": {}}
     for f, name in enumerate(names):
-        of = lambda a, f=f: a[f]  # noqa: E731
-        lost = totals.lost[:, f]
-        for into, sums, square, run_of, without in (
-            (every_run, totals.all, r.worst[f], r.worst_run[f], False),
-            (kept, totals.kept, r.kept_worst[f], r.kept_worst_run[f], True),
-        ):
-            worst = {b: Worst(float(np.sqrt(square[k])), int(run_of[k])) for k, b in enumerate(task.blocks)}
-            own = jax.tree.map(of, sums._replace(paired=()))
-            nees = np.where(without & lost, np.nan, totals.nees[f])
-            credible = _credible(totals.error[f], nees, own.outer, own.rows.number[:, 0], task.steps)
-            into[name] = scores(own, task.blocks, dim, task.confidence, worst, credible)
-        first = tuple(int(n) for n in r.named[f] if n != NOBODY)
-        diverged[name] = Diverged(int(r.diverged[f]), first)
-        faults[name] = _fault(totals, f, task.sensors)
-    pairs = zip(*np.triu_indices(len(names), 1), strict=True)
-    differences = {
-        (names[a], names[b]): paired(jax.tree.map(lambda x, k=k: x[k], totals.kept.paired), task.blocks)
-        for k, (a, b) in enumerate(pairs)
-    }
-    return every_run, kept, diverged, faults, differences
+        found["scores"][name] = _scores(task, totals, f, totals.all, r.worst[f], r.worst_run[f], totals.nees[f])
+        kept_nees = np.where(totals.lost[:, f], np.nan, totals.nees[f])
+        found["kept"][name] = _scores(task, totals, f, totals.kept, r.kept_worst[f], r.kept_worst_run[f], kept_nees)
+        first = tuple(int(run) for run in r.named[f] if run != NOBODY)
+        found["diverged"][name] = Diverged(int(r.diverged[f]), first)
+        found["faults"][name] = _fault(r, f, task.sensors)
+    for k, (a, b) in enumerate(zip(*np.triu_indices(len(names), 1), strict=True)):
+        differences = jax.tree.map(lambda x, k=k: x[k], totals.kept.paired)
+        found["paired"][names[a], names[b]] = paired(differences, task.blocks)
+    return found
+
+
+def _scores(
+    task: Task, totals: Totals, f: int, sums: Sums, square: np.ndarray, run_of: np.ndarray, nees: np.ndarray
+) -> Scores:
+    """Those of filter number f over one of the two sets of runs."""
+    own = jax.tree.map(lambda a: a[f], sums._replace(paired=()))
+    worst = {b: Worst(float(np.sqrt(square[k])), int(run_of[k])) for k, b in enumerate(task.blocks)}
+    credible = _credible(totals.error[f], nees, own.outer, own.rows.number[:, 0], task.steps)
+    return scores(own, task.blocks, task.space.dim, task.confidence, worst, credible)
 
 
 def _credible(error: np.ndarray, nees: np.ndarray, outer: np.ndarray, count: np.ndarray, steps: int) -> tuple:
@@ -261,8 +260,7 @@ def _credible(error: np.ndarray, nees: np.ndarray, outer: np.ndarray, count: np.
     return tuple(result)
 
 
-def _fault(totals: Totals, f: int, sensors: Sequence[str]) -> Fault | None:
-    r = totals.records
+def _fault(r: Records, f: int, sensors: Sequence[str]) -> Fault | None:
     if r.fault[f] == NO_FAULT:
         return None
     step, sensor = divmod(int(r.fault[f]), len(sensors))
