@@ -6,6 +6,7 @@ import functools
 import shlex
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +21,7 @@ from jaxfilt.study import Interrupted, Study
 from jaxfilt.study import study as monte_carlo
 from jaxfilt.sweep import Sweep
 from jaxfilt.sweep import sweep as many_studies
-from jaxfilt.types import Filter, Gaussian, Model, PyTree
+from jaxfilt.types import Filter, Gaussian, Log, Model, PyTree, Scenario
 
 MISSING: str | None = None
 if TYPE_CHECKING:
@@ -115,7 +116,6 @@ def study(
     folder = asked.writable(out or f"jaxfilt-out/study-{label}")
     bank = {name: functools.partial(_assuming, make, chosen.model) for name, make in makers.items()}
     log, key = chosen.schedule(steps), jax.random.key(seed)
-    limit: Bound | None = None
     options: dict[str, Any] = {
         "runs": runs,
         "control": chosen.control,
@@ -125,25 +125,31 @@ def study(
         "out": folder,
         "resume": resume,
     }
-    with explained(source), terminal.progress_bar() as progress:
+    with explained(source), terminal.progress_bar() as progress, ThreadPoolExecutor(1) as beside:
         asked.rescaled(chosen.model(chosen.theta), believed | dict.fromkeys(over, 1.0))
         options |= {"progress": progress, "corrupt": asked.corruption(corrupt or [], chosen.model, chosen.theta)}
         robot = chosen.model, bank, functools.partial(_believed, chosen.belief), log, key
+        # The bound is of the truth's own model and noise, and compiles while the study does.
+        wanted = bound and not over and not corrupt
+        limit = beside.submit(_bound, chosen, log, key) if wanted else None
         result, interrupted = _simulated(robot, chosen.theta, believed, over, options)
-        if bound and not over and not corrupt and not interrupted:
-            limit = cramer_rao(
-                chosen.model, chosen.belief, log, key, theta=chosen.theta, runs=BOUND_RUNS, control=chosen.control
-            )
+        least = limit.result() if limit and not interrupted else None
     done = _one_of(result).runs
     title = f"{label}: {done:,} runs of {steps:,} steps, {dtype}, seed {seed}"
     if isinstance(result, Sweep):
         terminal.show_sweep(result, title)
     else:
-        terminal.show_study(result, title, limit)
-    _finish(result, folder, label, limit)
+        terminal.show_study(result, title, least)
+    _finish(result, folder, label, least)
     if interrupted:
         print(f"interrupted after {done:,} of {runs:,} runs; go on with: {_command()} --resume", file=sys.stderr)
     return 130 if interrupted else 0
+
+
+def _bound(chosen: Scenario, log: Log, key: Any) -> Bound:
+    return cramer_rao(
+        chosen.model, chosen.belief, log, key, theta=chosen.theta, runs=BOUND_RUNS, control=chosen.control
+    )
 
 
 def _simulated(

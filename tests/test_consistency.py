@@ -84,9 +84,9 @@ MILD = {"car": (car.scenario, 4), "car-like": (car.car_like_scenario, 6), "multi
 @pytest.mark.parametrize("name", MILD)
 def test_in_a_mild_scenario_the_bands_hold_and_a_wrong_q_is_found(name):
     scenario, dim = MILD[name]
-    sound = {"ekf": jf.ekf, "ukf": jf.ukf, "ckf": jf.ckf}
+    sound = {"ekf": jf.ekf, "ukf": jf.ukf} | ({"ckf": jf.ckf} if dim < 12 else {})  # in 12 it compiles for long
     wrong = {"Q / 4": wrong_q(jf.ekf, 0.25), "4 Q": wrong_q(jf.ekf, 4.0)}
-    values = nees_of(scenario(), sound | wrong, steps=150)
+    values = nees_of(scenario(), sound | wrong, steps=150, runs=RUNS if dim < 12 else 250)
     for name in sound:
         # One step in a thousand may be out of its band, and neighbours go together.
         assert inside(values[name], dim)[::10].mean() > 0.9, name
