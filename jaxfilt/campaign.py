@@ -50,17 +50,19 @@ def run(
     if progress:
         progress(done, task.runs)
     interrupted = False
-    try:
-        for part in _parts(task, program, arguments, done):
-            state = part if state is None else added(state, part, task.sample)
-            if book is not None:
-                checkpoint.save(book, state, int(state.done))
-            if progress:
-                progress(int(state.done), task.runs)
-    except KeyboardInterrupt:
-        if state is None:
-            raise
-        interrupted = True
+    # Ctrl-C strikes the main thread alone: what another one has begun to write is written whole.
+    with ThreadPoolExecutor(1) as writer:
+        try:
+            for part in _parts(task, program, arguments, done):
+                state = part if state is None else added(state, part, task.sample)
+                if book is not None:
+                    writer.submit(checkpoint.save, book, state, int(state.done)).result()
+                if progress:
+                    progress(int(state.done), task.runs)
+        except KeyboardInterrupt:
+            if state is None:
+                raise
+            interrupted = True
     assert state is not None
     return Outcome(state, interrupted, ready - began, time.perf_counter() - ready)
 

@@ -15,6 +15,14 @@ F32 = np.float32
 system = functools.cache(lambda name: SYSTEMS[name]())
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _as_users_compile():
+    """Which digits are lost in single precision depends on what the compiler makes of the code."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
 @pytest.fixture(scope="module")
 def track32():
     """The track of a system and filter, all of it float32."""
