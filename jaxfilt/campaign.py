@@ -41,10 +41,12 @@ def run(
     leaves, structure = jax.tree.flatten(jax.eval_shape(lambda *a: a, *example))
     program = compiled(task.plan, task.devices, structure, tuple(leaves))
     about = task.about | {"chunk": task.chunk, "devices": len(task.devices), "program": program.digest}
-    state, writes = None, out is not None and jax.process_index() == 0
+    state, book = None, None
     if out is not None and resume:
         state = checkpoint.load(Path(out), about, _structure(program))
-    book = checkpoint.begin(Path(out), about, task.runs, resume) if out is not None and writes else None
+    if out is not None and jax.process_index() == 0:
+        book = checkpoint.begin(Path(out), about, task.runs, resume)
+    arguments = placed(task.plan, task.devices, arguments)
     done = 0 if state is None else int(state.done)
     ready = time.perf_counter()
     if progress:
@@ -112,5 +114,5 @@ def _part(task: Task, program: Program, arguments: tuple, first: int) -> Totals:
 
 
 def _called(task: Task, program: Program, arguments: tuple, numbers: np.ndarray, weights: np.ndarray) -> Chunk:
-    everything = (*arguments, numbers.astype(np.int32), weights)
-    return program.call(*(everything if len(task.devices) == 1 else placed(task.plan, task.devices, everything)))
+    own = placed(task.plan, task.devices, (numbers.astype(np.int32), weights), first=len(arguments))
+    return program.call(*arguments, *own)

@@ -127,15 +127,20 @@ def compiled(plan: Plan, devices: tuple, structure: Any, leaves: tuple) -> Progr
     return Program(lowered.compile(), digest)
 
 
-def placed(plan: Plan, devices: tuple, arguments: tuple) -> tuple:
-    """The arguments as arrays that lie on these devices, of this process and of others."""
+def placed(plan: Plan, devices: tuple, arguments: tuple, first: int = 0) -> tuple:
+    """Arguments of a program, from number ``first`` on, as arrays that lie on its devices, also of other processes.
+
+    One device takes them as they are.
+    """
+    if len(devices) == 1:
+        return arguments
     mesh = _mesh(devices)
 
     def place(spec: PartitionSpec) -> Callable[[Array], jax.Array]:
         sharding = NamedSharding(mesh, spec)
         return lambda a: jax.make_array_from_callback(np.shape(a), sharding, lambda at: np.asarray(a)[at])
 
-    return tuple(jax.tree.map(place(spec), a) for spec, a in zip(_specs(plan), arguments, strict=True))
+    return tuple(jax.tree.map(place(spec), a) for spec, a in zip(_specs(plan)[first:], arguments, strict=False))
 
 
 def _mesh(devices: tuple) -> Mesh:

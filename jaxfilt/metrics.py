@@ -18,9 +18,6 @@ import numpy as np
 
 from jaxfilt import chisquare, doors, linalg
 from jaxfilt.consistency import CONFIDENCE, Consistency, mean_of_squares, ratio
-from jaxfilt.consistency import anees_total as anees_total
-from jaxfilt.consistency import share_inside as share_inside
-from jaxfilt.consistency import verdict as verdict
 from jaxfilt.types import Array, Info, PyTree, Space, Status
 
 DIVERGED = 1e-9

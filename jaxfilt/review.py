@@ -84,7 +84,7 @@ def replayed(
         >>> drive = jf.Recording(jax.tree.map(np.asarray, log), np.arange(200.0))
         >>> truth = jf.Truth(x, np.full(200, True))
         >>> r = jf.Replay(walk, start, (), drive, truth, jf.vector(1), lambda x: x, {"position": ((0,), "m")})
-        >>> metrics.verdict(replayed(r, {"kf": lambda theta: jf.kf(walk(theta))}).reviews["kf"].nis["z"])
+        >>> jf.consistency.verdict(replayed(r, {"kf": lambda theta: jf.kf(walk(theta))}).reviews["kf"].nis["z"])
         'inside'
     """
     theta = replay.theta if theta is None else theta

@@ -151,8 +151,7 @@ def scores(
         nis[name] = consistency.mean_of_squares(total, dof, used, confidence)
         overall = consistency.mean_of_squares(total.sum(), dof.sum(), used.sum(), confidence)
         nis_total[name] = Consistency(*map(float, overall))
-        dots, pairs = sums.dots[name], np.round(sums.pairs[name])
-        white[name] = metrics.whiteness_of_sums(dots, pairs, total.sum(), dof.sum(), confidence)
+        white[name] = metrics.whiteness_of_sums(sums.dots[name], sums.pairs[name], total.sum(), dof.sum(), confidence)
     counted = np.maximum(row["error"].number[:, :1], 1)
     return Scores(
         runs=int(sums.runs),

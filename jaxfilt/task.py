@@ -227,8 +227,8 @@ def _chunk(
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(space.origin))
     readings = sum(np.size(leaf) // len(log.dt) for leaf in jax.tree.leaves(log.z))
     size += readings + sum(np.size(leaf) // len(log.dt) for leaf in jax.tree.leaves(log.u if o.control else ()))
-    # Of each filter: error, normalised error, NEES, and each sensor's normalised innovation and degrees of freedom.
-    scored = 2 * space.dim + 1 + len(o.blocks or range(space.dim)) + readings + len(log.z)
+    # Of each filter: error, normalised error, NEES, and each sensor's normalised innovation.
+    scored = 2 * space.dim + 1 + len(o.blocks or range(space.dim)) + readings
     size += settings * len(filters) * scored
     most = devices * max(1, int(MEMORY / (size * len(log.dt) * dtype.itemsize)))
     chunks = -(-o.runs // most)

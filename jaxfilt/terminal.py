@@ -12,6 +12,7 @@ from jaxfilt import consistency
 from jaxfilt.bound import Bound
 from jaxfilt.consistency import Consistency
 from jaxfilt.metrics import Whiteness
+from jaxfilt.report.summary import least
 from jaxfilt.review import Replayed
 from jaxfilt.scores import STATE, Estimate
 from jaxfilt.study import Study
@@ -80,13 +81,11 @@ def show_study(s: Study, title: str, bound: Bound | None) -> None:
     if bound is not None:
         table.add_section()
         for block, (index, _) in s.blocks.items():
-            least, fair = (np.diagonal(c, axis1=1, axis2=2)[:, list(index)].sum(1).mean() for c in bound[:2])
             square = [c.rmse_total[block].value ** 2 for c in s.kept.values()]
-            exact = [f"{100 * least / e:.0f} %" for e in square] if bound.exact else ["" for _ in square]
-            near = [f"{100 * fair / e:.0f} %" for e in square]
-            if bound.exact:
-                _row(table, f"bound / MSE {block}", exact)
-            _row(table, f"linearised bound / MSE {block}", near)
+            limits = ({"bound": bound.cov} if bound.exact else {}) | {"linearised bound": bound.linearised}
+            for name, cov in limits.items():
+                mean = (least(cov, index) ** 2).mean()
+                _row(table, f"{name} / MSE {block}", [f"{100 * mean / e:.0f} %" for e in square])
     table.add_section()
     for block, first in scores[0].nees_total.items():
         what = f"mean NEES ({first.expected:g})" if block == STATE else f"  {block} ({first.expected:g})"

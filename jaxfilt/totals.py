@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxfilt.chunk import Chunk, Each, Examples
+from jaxfilt.chunk import NO_FAULT, Chunk, Each, Examples
 from jaxfilt.tally import Sums
 from jaxfilt.types import Array
 
@@ -92,14 +92,13 @@ def _records(each: Each, numbers: np.ndarray, counts: np.ndarray) -> Records:
     runs = numbers.astype(np.int64)[counts]
     diverged, fault, status = (a[..., counts, :] for a in (each.diverged, each.fault, each.status))
     worst = each.worst[..., counts, :, :]
-    none = np.iinfo(np.int32).max
     named = np.sort(np.where(np.moveaxis(diverged, -2, -1), runs, NOBODY), -1)[..., :NAMED]
     kept_worst = np.where(diverged[..., None], 0.0, worst)
     first = fault.argmin(-2)
     return Records(
         diverged=diverged.sum(-2),
         named=np.pad(named, [(0, 0)] * (named.ndim - 1) + [(0, NAMED - named.shape[-1])], constant_values=NOBODY),
-        faulty=(fault != none).sum(-2),
+        faulty=(fault != NO_FAULT).sum(-2),
         fault=fault.min(-2),
         fault_run=runs[first],
         status=np.take_along_axis(status, first[..., None, :], -2)[..., 0, :],

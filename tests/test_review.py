@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 import jaxfilt as jf
-from jaxfilt import metrics
+from jaxfilt import consistency
 from jaxfilt.review import replayed
 
 A = np.array([[1.0, 0.1], [0.0, 1.0]])
@@ -65,7 +65,7 @@ def test_a_replay_is_scored_against_the_part_that_the_truth_knows(drive, found, 
     assert review.rmse == {"position": pytest.approx(np.sqrt((error[mask] ** 2).mean()))}
     assert review.nees_mean.mean == pytest.approx((error[mask] ** 2 / variance[mask]).mean())
     assert review.nees_mean.expected == 1.0
-    assert metrics.verdict(review.nees_mean) == "inside"
+    assert consistency.verdict(review.nees_mean) == "inside"
     assert not review.diverged
     assert review.fault is None
     assert (found.space.dim, found.dtype, found.theta, found.blocks) == (1, "float64", RIGHT, drive.blocks)
@@ -94,7 +94,7 @@ def test_innovations_are_scored_as_by_hand(found, track):
         )
         cdf, sf = scipy.stats.chi2.cdf(total, dof * ROWS), scipy.stats.chi2.sf(total, dof * ROWS)
         assert nis.p == pytest.approx(2 * min(cdf, sf))
-        assert metrics.verdict(nis) == "inside"
+        assert consistency.verdict(nis) == "inside"
         white = review.whiteness[sensor]
         e = np.linalg.solve(np.linalg.cholesky(info.S), info.innovation[..., None])[..., 0]
         a, b = e[:-3], e[3:]
@@ -116,7 +116,7 @@ def test_a_replay_without_truth_is_judged_by_its_innovations_alone(drive):
     blind = blind._replace(blocks={"whole": ((0, 1), "")})
     wrong = replayed(blind, {"kf": FILTERS["kf"]}, theta={"q": 0.0, "r": np.log(4.0)}).reviews["kf"]
     assert wrong.error is wrong.nees is wrong.rmse is wrong.nees_mean is None
-    assert metrics.verdict(wrong.nis["near"]) == "below"
+    assert consistency.verdict(wrong.nis["near"]) == "below"
     assert wrong.std.shape == (ROWS, 2)
     assert not wrong.diverged
 

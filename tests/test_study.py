@@ -8,7 +8,7 @@ import scipy.stats
 from jax.core import Tracer
 
 import jaxfilt as jf
-from jaxfilt import metrics, mismatch
+from jaxfilt import consistency, mismatch
 from jaxfilt.consistency import Consistency
 from jaxfilt.study import study
 
@@ -336,9 +336,9 @@ def test_noise_wrong_by_four_is_found_both_ways_and_other_parameters_compile_not
     over, under = (run(truth_theta=wrong), run(theta=wrong, truth_theta=RIGHT))
     assert not TRACED
     for found, verdict in ((over, "above"), (under, "below")):
-        assert metrics.verdict(found.scores["kf"].nees_total["state"]) == verdict
-        assert metrics.verdict(found.scores["kf"].nis_total["near"]) == verdict
-    assert metrics.share_inside(over.scores["kf"].nees["state"]) < 0.2
+        assert consistency.verdict(found.scores["kf"].nees_total["state"]) == verdict
+        assert consistency.verdict(found.scores["kf"].nis_total["near"]) == verdict
+    assert consistency.share_inside(over.scores["kf"].nees["state"]) < 0.2
     assert over.truth_theta == under.theta == wrong
     assert over.theta == under.truth_theta == RIGHT
 
@@ -594,7 +594,7 @@ def test_single_precision_stays_single():
     np.testing.assert_allclose(scores.nees["state"].mean, nees.mean(0), rtol=1e-5)
     assert isinstance(scores.nees_total["state"], Consistency)
     assert scores.nees_total["state"].mean == pytest.approx(nees.mean(), rel=1e-5)
-    assert metrics.verdict(scores.nees_total["state"]) == "inside"
+    assert consistency.verdict(scores.nees_total["state"]) == "inside"
 
 
 # --- at the door ------------------------------------------------------------------------------------------------------

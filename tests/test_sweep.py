@@ -10,7 +10,7 @@ import scipy.linalg
 from jax.core import Tracer
 
 import jaxfilt as jf
-from jaxfilt import metrics
+from jaxfilt import consistency
 from jaxfilt.study import study
 from jaxfilt.sweep import sweep
 
@@ -141,7 +141,7 @@ def test_the_anees_falls_with_the_factor_on_q_as_the_riccati_equation_says(over_
     It falls up to 3; far beyond, where the filter believes its readings alone, it is on its way back to 1.
     """
     anees = over_q.curve(lambda s: s.scores["kf"].nees["state"].mean[-1])
-    verdicts = [metrics.verdict(s.scores["kf"].nees_total["state"]) for s in over_q.studies[:4]]
+    verdicts = [consistency.verdict(s.scores["kf"].nees_total["state"]) for s in over_q.studies[:4]]
     assert (np.diff(anees[:4]) < 0).all()
     assert verdicts == ["above", "above", "inside", "below"]
     one = np.eye(1)
