@@ -1,5 +1,6 @@
 """jaxfilt: differentiable, batched Kalman filters in JAX."""
 
+from jaxfilt import priors
 from jaxfilt.bootstrap import block_bootstrap
 from jaxfilt.bound import Bound, cramer_rao, efficiency
 from jaxfilt.check import Checkup, check
@@ -7,12 +8,26 @@ from jaxfilt.diagnose import Diagnosis, diagnose
 from jaxfilt.elementary import bearing, cosc, norm, sinc, wrap
 from jaxfilt.files import load, save
 from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
+from jaxfilt.fit import Fit
+from jaxfilt.fold import Objective, Seen
 from jaxfilt.integrate import euler, rk4
 from jaxfilt.log import align, merge, schedule, stack, validate
 from jaxfilt.mismatch import scaled
 from jaxfilt.models.linear import linear
 from jaxfilt.models.sensors import range_bearing
-from jaxfilt.noise import Parametrisation, blocks, const, diagonal, log_cholesky, log_std, van_loan, white
+from jaxfilt.noise import (
+    Parametrisation,
+    blocks,
+    const,
+    diagonal,
+    floored,
+    log_cholesky,
+    log_std,
+    shared,
+    van_loan,
+    white,
+)
+from jaxfilt.objectives import held_back, likelihood, log_score, mix, mse, nees_match, nis_match
 from jaxfilt.report.arrays import to_xarray
 from jaxfilt.review import Replayed, Review, replayed
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
@@ -22,6 +37,8 @@ from jaxfilt.spaces import angle, product, rotate, rotate_back, scalar, so2, so3
 from jaxfilt.study import Interrupted, Study, study
 from jaxfilt.sweep import Sweep, sweep
 from jaxfilt.transforms import cubature, gauss_hermite, taylor, unscented
+from jaxfilt.tune import tune
+from jaxfilt.tuning.split import Split
 from jaxfilt.types import (
     Filter,
     Gaussian,
@@ -46,12 +63,14 @@ __all__ = [
     "Checkup",
     "Diagnosis",
     "Filter",
+    "Fit",
     "Gaussian",
     "Info",
     "Interrupted",
     "Log",
     "Model",
     "Moments",
+    "Objective",
     "Paired",
     "Parametrisation",
     "Recording",
@@ -60,9 +79,11 @@ __all__ = [
     "Review",
     "Scenario",
     "Scores",
+    "Seen",
     "Sensor",
     "Simulation",
     "Space",
+    "Split",
     "Status",
     "Stream",
     "Study",
@@ -87,19 +108,28 @@ __all__ = [
     "efficiency",
     "ekf",
     "euler",
+    "floored",
     "gauss_hermite",
+    "held_back",
     "iekf",
     "innovation_verdict",
     "kf",
+    "likelihood",
     "linear",
     "load",
     "log_cholesky",
     "log_likelihood",
+    "log_score",
     "log_std",
     "mean_and_std",
     "mean_only",
     "merge",
+    "mix",
+    "mse",
+    "nees_match",
+    "nis_match",
     "norm",
+    "priors",
     "product",
     "range_bearing",
     "replayed",
@@ -113,6 +143,7 @@ __all__ = [
     "scan",
     "scan_runs",
     "schedule",
+    "shared",
     "simulate",
     "sinc",
     "so2",
@@ -124,6 +155,7 @@ __all__ = [
     "sweep",
     "taylor",
     "to_xarray",
+    "tune",
     "ukf",
     "unscented",
     "validate",

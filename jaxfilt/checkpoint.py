@@ -1,4 +1,4 @@
-"""A study's state in a folder, so that one that was killed goes on from its last finished chunk."""
+"""The state of a long computation in a folder, so that one that was killed goes on from where it last kept it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,22 @@ MANIFEST_FILE = "manifest.json"
 SCHEMA = "jaxfilt.checkpoint/1"
 
 
+class Kind(NamedTuple):
+    """What it is that keeps its state, and what it counts."""
+
+    name: str
+    unit: str
+
+
+STUDY, TUNING = Kind("study", "runs"), Kind("tuning", "steps")
+
+
 class Checkpoint(NamedTuple):
-    """Where a study keeps its state, and the manifest that says what the study is."""
+    """Where a computation keeps its state, and the manifest that says what it is."""
 
     folder: Path
     manifest: dict[str, Any]
+    kind: Kind
 
 
 def version(package: str) -> str:
@@ -64,25 +75,26 @@ def fingerprint(tree: PyTree) -> str:
     return digest.hexdigest()[:16]
 
 
-def begin(folder: Path, about: dict[str, Any], runs: int, resume: bool = False) -> Checkpoint:
-    """The checkpoint of a study in a folder, made if need be; a new one removes the state of a finished study.
+def begin(folder: Path, about: dict[str, Any], total: int, resume: bool = False, kind: Kind = STUDY) -> Checkpoint:
+    """The checkpoint of a computation in a folder, made if need be; a new one removes the state of a finished one.
 
     Raises:
         OSError: the folder cannot be written.
-        FileExistsError: it holds a study that was not finished, and is not to be resumed.
+        FileExistsError: it holds one that was not finished, and is not to be resumed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    checkpoint = Checkpoint(folder, {"schema": SCHEMA, "runs": runs, "made_with": made_with()} | about)
+    checkpoint = Checkpoint(folder, {"schema": SCHEMA, kind.unit: total, "made_with": made_with()} | about, kind)
     if resume:
         return checkpoint
     old = read_manifest(folder)
-    if old is not None and old["runs_done"] < old["runs"]:
-        raise FileExistsError(
-            f"{folder} holds a study that stopped after {old['runs_done']:,} of {old['runs']:,} runs: "
-            "resume it, or remove the folder to begin anew"
-        )
+    for name, unit in (STUDY, TUNING):
+        if old is not None and f"{unit}_done" in old and old[f"{unit}_done"] < old[unit]:
+            raise FileExistsError(
+                f"{folder} holds a {name} that stopped after {old[f'{unit}_done']:,} of {old[unit]:,} {unit}: "
+                "resume it, or remove the folder to begin anew"
+            )
     (folder / STATE_FILE).unlink(missing_ok=True)
-    write_whole(folder / MANIFEST_FILE, _json(checkpoint.manifest | {"runs_done": 0}))
+    write_whole(folder / MANIFEST_FILE, _json(checkpoint.manifest | {f"{kind.unit}_done": 0}))
     return checkpoint
 
 
@@ -101,50 +113,53 @@ def save(checkpoint: Checkpoint, state: PyTree, done: int) -> None:
     Raises:
         OSError: it cannot be written; the state before it stays.
     """
+    name, unit = checkpoint.kind
     buffer = io.BytesIO()
-    manifest = json.dumps(checkpoint.manifest | {"runs_done": done})
-    np.savez(buffer, manifest=np.array(manifest), **{str(i): a for i, a in enumerate(jax.tree.leaves(state))})
+    about = checkpoint.manifest | {f"{unit}_done": done}
+    np.savez(buffer, manifest=np.array(json.dumps(about)), **{str(i): a for i, a in enumerate(jax.tree.leaves(state))})
     try:
         write_whole(checkpoint.folder / STATE_FILE, buffer.getvalue())
-        write_whole(checkpoint.folder / MANIFEST_FILE, _json(checkpoint.manifest | {"runs_done": done}))
+        write_whole(checkpoint.folder / MANIFEST_FILE, _json(about))
     except OSError as error:
         raise OSError(
             error.errno,
-            f"the study cannot keep its state after {done:,} runs ({error.strerror}); what it kept before is whole, "
+            f"the {name} cannot keep its state after {done:,} {unit} ({error.strerror}); what it kept before is whole, "
             "so that it can be resumed",
             str(checkpoint.folder),
         ) from error
 
 
-def load(folder: Path, about: dict[str, Any], structure: Any) -> PyTree:
-    """The state of the same study, to go on from; None where it was stopped before it had any.
+def load(folder: Path, about: dict[str, Any], structure: Any, kind: Kind = STUDY) -> PyTree:
+    """The state of the same computation, to go on from; None where it was stopped before it had any.
 
     Raises:
-        ValueError: what is there is another study; the text says what differs.
-        FileNotFoundError: there is no study.
+        ValueError: what is there is another one; the text says what differs.
+        FileNotFoundError: there is none.
     """
     old = read_manifest(folder)
     if old is None:
         if not (folder / MANIFEST_FILE).exists():
-            raise FileNotFoundError(f"{folder}: expected a study to resume, found none")
+            raise FileNotFoundError(f"{folder}: expected a {kind.name} to resume, found none")
         return None
+    if kind.unit not in old:
+        raise ValueError(f"{folder}: cannot resume, it holds no {kind.name}")
     here = json.loads(json.dumps(about | {"made_with": made_with()}))
     for what, mine in here.items():
         if mine != old.get(what):
-            raise ValueError(f"{folder}: cannot resume, {_difference(what, old.get(what), mine)}")
+            raise ValueError(f"{folder}: cannot resume, {_difference(what, old.get(what), mine, kind.name)}")
     with np.load(folder / STATE_FILE) as file:
         return jax.tree.unflatten(structure, [file[str(i)] for i in range(len(file.files) - 1)])
 
 
-def _difference(what: str, old: Any, mine: Any) -> str:
+def _difference(what: str, old: Any, mine: Any, name: str) -> str:
     """What differs between two manifests, in words."""
     if what == "program":
         return "the model, the filters or the schedule have changed since"
     if isinstance(old, dict) and isinstance(mine, dict):
         for key in old | mine:
             if old.get(key) != mine.get(key):
-                return _difference(f"{what}.{key}", old.get(key), mine.get(key))
-    return f"it has {what} {old}, this study {mine}"
+                return _difference(f"{what}.{key}", old.get(key), mine.get(key), name)
+    return f"it has {what} {old}, this {name} {mine}"
 
 
 def _json(what: dict[str, Any]) -> bytes:

@@ -67,6 +67,13 @@ def instance(name: str, x: Any, kind: type) -> None:
         raise TypeError(f"{name}: expected a {kind.__name__}, got {type(x).__name__}")
 
 
+def alike(name: str, x: PyTree, like: PyTree) -> None:
+    """Raise unless x has the structure and the shapes of another tree."""
+    same = jax.tree.structure(x) == jax.tree.structure(like)
+    if not same or [np.shape(a) for a in jax.tree.leaves(x)] != [np.shape(a) for a in jax.tree.leaves(like)]:
+        raise ValueError(f"{name}: expected {describe(like)}, got {describe(x)}")
+
+
 def array(name: str, x: Any) -> None:
     """Raise unless x is an array: a list would only be found out later, inside."""
     if not (hasattr(x, "shape") and hasattr(x, "dtype")):

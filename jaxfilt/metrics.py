@@ -73,8 +73,7 @@ def nees(error: Array, cov: Array) -> jax.Array:
     """
 
     def one(e: Array, P: Array) -> jax.Array:
-        w = linalg.forward_solve(linalg.cholesky(P), e)
-        return w @ w
+        return _score(e, P)[0]
 
     return jnp.vectorize(one, signature="(n),(n,n)->()")(error, cov)
 
@@ -101,11 +100,15 @@ def log_score(error: Array, cov: Array) -> jax.Array:
     """
 
     def one(e: Array, P: Array) -> jax.Array:
-        L = linalg.cholesky(P)
-        w = linalg.forward_solve(L, e)
-        return -0.5 * (w @ w + len(e) * math.log(2 * math.pi)) - jnp.log(jnp.diagonal(L)).sum()
+        square, log_determinant = _score(e, P)
+        return -0.5 * (square + log_determinant + len(e) * math.log(2 * math.pi))
 
     return jnp.vectorize(one, signature="(n),(n,n)->()")(error, cov)
+
+
+def _score(e: Array, P: Array) -> tuple[jax.Array, jax.Array]:
+    """``e' P^-1 e`` and ``log |P|``."""
+    return linalg.score(P, linalg.cholesky(jax.lax.stop_gradient(P)), e)
 
 
 def rmse(error: Array, blocks: Blocks, mask: Array | None = None) -> dict[str, float]:

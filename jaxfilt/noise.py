@@ -53,6 +53,15 @@ def van_loan(A: Array, density: Array) -> Callable[[PyTree, PyTree, Array], Arra
         >>> [[round(float(q), 4) for q in row] for row in Q(None, None, 1.0)]
         [[1.0, 1.5], [1.5, 3.0]]
 
+    Example: tuning the density, of the unit m/s^2 per root Hz. What theta adds to its logarithm, Q feels twice.
+        >>> import jax
+        >>> A, B = jnp.array([[0.0, 1.0], [0.0, 0.0]]), jnp.array([[0.0], [1.0]])
+        >>> def variance_of_position(theta):
+        ...     return jf.van_loan(A, B @ jf.log_std.cov(theta["acceleration"]) @ B.T)(None, None, 1.0)[0, 0]
+        >>> value, slope = jax.value_and_grad(variance_of_position)({"acceleration": 0.5 * jnp.log(jnp.array([3.0]))})
+        >>> round(float(value), 4), round(float(slope["acceleration"][0]), 4)
+        (1.0, 2.0)
+
     The usual block matrix holds exp(-A dt), which at 30 time constants has cost float64 all its digits. Here the
     integral over a small h, a power series, is doubled until it covers dt, by sums of what is positive only:
     ``Q(2h) = Q(h) + F Q(h) F'`` with ``F = exp(A h)``, kept as ``N = F - I``.
@@ -113,6 +122,38 @@ log_std = Parametrisation(lambda theta: jnp.diag(jnp.exp(2 * theta)), _log_std_i
 """A diagonal covariance from the logarithms (n,) of its standard deviations; the inverse drops correlations."""
 
 
+def shared(n: int) -> Parametrisation:
+    """The same variance on n axes, without correlations, from one number (): the logarithm of the standard deviation.
+
+    The inverse takes the mean of the variances.
+
+    Example: GNSS, as good north as east.
+        >>> import math
+        >>> shared(2).cov(math.log(3.0)).round(4).tolist()
+        [[9.0, 0.0], [0.0, 9.0]]
+
+    Raises:
+        ValueError: n < 1; a theta that is not one number; for the inverse, what is no covariance, or 0.
+    """
+    if n < 1:
+        raise ValueError(f"shared(n): expected at least 1, got {n}")
+
+    def cov(theta: Array) -> Array:
+        if np.shape(theta) != ():
+            raise ValueError(f"theta: expected one number, got shape {np.shape(theta)}")
+        variance = jnp.exp(2 * jnp.asarray(theta))
+        return variance * jnp.eye(n, dtype=variance.dtype)
+
+    def theta(cov: Array) -> Array:
+        doors.covariance("cov", cov, n)
+        variance = jnp.mean(jnp.diagonal(cov))
+        if doors.is_concrete(variance) and not variance > 0:
+            raise ValueError(f"cov: expected a positive variance, got {variance:.6g}")
+        return 0.5 * jnp.log(variance)
+
+    return Parametrisation(cov, theta)
+
+
 def log_cholesky(n: int) -> Parametrisation:
     """A full (n, n) covariance ``L L'`` from n (n + 1) / 2 numbers: L row by row, its diagonal as logarithms.
 
@@ -158,5 +199,48 @@ def blocks(*parts: tuple[Parametrisation, int]) -> Parametrisation:
     def theta(cov: Array) -> tuple:
         doors.covariance("cov", cov, ends[-1])
         return tuple(p.theta(cov[i:j, i:j]) for (p, _), i, j in zip(parts, starts, ends, strict=True))
+
+    return Parametrisation(cov, theta)
+
+
+def floored(parametrisation: Parametrisation, std: Array | float) -> Parametrisation:
+    """A covariance that never falls below a floor: ``cov(theta) + diag(std^2)``, whatever theta.
+
+    Args:
+        parametrisation: of what comes on top of the floor.
+        std: standard deviation of the floor, one number or (n,), >= 0, in the unit of each axis: a sensor's resolution,
+            say. What lies on the floor is not moved by theta any more.
+
+    Returns:
+        A `Parametrisation` whose theta is that of the one given.
+
+    Raises:
+        ValueError: a std that is negative or not finite; for the inverse, a covariance that is not above the floor.
+
+    Example: a range finder that resolves 1 cm.
+        >>> import jax.numpy as jnp
+        >>> R = floored(log_std, 0.01)
+        >>> round(float(R.cov(jnp.array([-50.0]))[0, 0] ** 0.5), 4)
+        0.01
+    """
+    std = np.asarray(std, np.float64)
+    if not (np.isfinite(std) & (std >= 0)).all():
+        raise ValueError(f"floored(std): expected finite numbers >= 0, got {std}")
+
+    def floor(like: Array) -> jax.Array:
+        if std.shape not in ((), like.shape[:1]):
+            raise ValueError(f"floored(std): expected one number or shape {like.shape[:1]}, got {std.shape}")
+        return jnp.diag(jnp.asarray(np.broadcast_to(std**2, like.shape[:1]), like.dtype))
+
+    def cov(theta: PyTree) -> Array:
+        above = parametrisation.cov(theta)
+        return above + floor(above)
+
+    def theta(cov: Array) -> PyTree:
+        doors.covariance("cov", cov)
+        above = jnp.asarray(cov) - floor(cov)
+        if doors.is_concrete(above) and np.isnan(linalg.cholesky(above)).any():
+            raise ValueError(f"cov: expected one above the floor, variances {std**2}, got {np.asarray(cov).tolist()}")
+        return parametrisation.theta(above)
 
     return Parametrisation(cov, theta)

@@ -4,11 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 import jaxfilt as jf
+from jaxfilt.noise import floored, shared
 
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
 
@@ -144,6 +147,11 @@ PARAMETRISATIONS = {
         jf.blocks((jf.log_cholesky(2), 2), (jf.log_std, 1)),
         np.array([[4.0, 1.0, 0], [1.0, 3.0, 0], [0, 0, 1e-8]]),
     ),
+    "shared": (shared(3), 0.25 * np.eye(3)),
+    "floored": (
+        floored(jf.blocks((jf.log_cholesky(2), 2), (shared(1), 1)), np.array([0.5, 0.1, 1e-5])),
+        np.array([[4.0, 1.0, 0], [1.0, 3.0, 0], [0, 0, 1e-8]]),
+    ),
 }
 EACH = pytest.mark.parametrize(("parametrisation", "P"), PARAMETRISATIONS.values(), ids=PARAMETRISATIONS.keys())
 
@@ -184,6 +192,94 @@ def test_any_numbers_make_a_covariance_and_gradients(parametrisation, P):
         assert f(numbers)[1] @ direction == pytest.approx(float(difference), rel=1e-6)
 
 
+PER_AXIS = jf.blocks((shared(2), 2), (jf.log_std, 1))
+ANY = st.floats(-15, 15)  # of a log-standard-deviation: nanometres to thousands of kilometres
+SAME_SIZE = st.floats(-2, 2)  # of the rows of a Cholesky factor, whose products else are singular to rounding
+
+
+def proper(cov):
+    cov = np.asarray(cov)
+    np.testing.assert_array_equal(cov, cov.T)
+    np.linalg.cholesky(correlations(cov, cov))  # raises unless positive definite
+
+
+@settings(deadline=None, max_examples=30, derandomize=True, database=None)
+@given(st.tuples(ANY, st.lists(ANY, min_size=1, max_size=1).map(np.array)), st.floats(1e-6, 1e3))
+def test_always_positive_definite_and_never_below_the_floor(theta, floor):
+    proper(PER_AXIS.cov(theta))
+    cov = floored(PER_AXIS, floor).cov(theta)
+    proper(cov)
+    assert (np.linalg.eigvalsh(np.asarray(cov)) >= floor**2 * (1 - 1e-12)).all()
+    np.testing.assert_allclose(np.diag(cov), np.exp(2 * np.r_[theta[0], theta[0], theta[1]]) + floor**2, rtol=1e-12)
+
+
+@settings(deadline=None, max_examples=30, derandomize=True, database=None)
+@given(st.lists(SAME_SIZE, min_size=6, max_size=6).map(np.array), st.floats(-8, 8), st.floats(1e-3, 1e3))
+def test_a_full_covariance_of_any_size_is_positive_definite(theta, size, relative_floor):
+    """``log_cholesky`` moved by ``size`` in every logarithm, and rows with it: the correlations stay."""
+    on_diagonal = np.array([0, 2, 5])
+    scaled = np.exp(size) * theta
+    scaled[on_diagonal] = theta[on_diagonal] + size
+    cov = jf.log_cholesky(3).cov(jnp.asarray(scaled))
+    proper(cov)
+    floor = relative_floor * float(np.sqrt(np.trace(cov)))
+    raised = np.asarray(floored(jf.log_cholesky(3), floor).cov(jnp.asarray(scaled)))
+    proper(raised)
+    assert np.linalg.eigvalsh(raised)[0] >= floor**2 * (1 - 1e-9)
+
+
+@DTYPES
+def test_one_number_for_many_axes(dtype):
+    theta = jnp.asarray(np.log(3.0), dtype)
+    assert shared(2).cov(theta).dtype == dtype
+    np.testing.assert_allclose(shared(2).cov(theta), 9 * np.eye(2), rtol=rtol(dtype))
+    unequal = shared(2).theta(jnp.diag(jnp.array([1.0, 7.0], dtype)))
+    assert float(jnp.exp(2 * unequal)) == pytest.approx(4.0, rel=rtol(dtype))
+    assert float(shared(1).cov(0.0)[0, 0]) == 1.0
+    np.testing.assert_allclose(jax.jacfwd(shared(2).cov)(theta), 18 * np.eye(2), rtol=rtol(dtype))
+
+
+@DTYPES
+def test_a_floor_by_axis_and_its_gradient(dtype):
+    """On the floor theta moves nothing; far above it, the floor is not felt."""
+    R = floored(jf.log_std, np.array([0.01, 2.0]))
+    low, high = jnp.asarray([-60.0, -60.0], dtype), jnp.asarray([5.0, 5.0], dtype)
+    assert R.cov(low).dtype == dtype
+    np.testing.assert_allclose(np.sqrt(np.diag(R.cov(low))), [0.01, 2.0], rtol=rtol(dtype))
+    np.testing.assert_allclose(jax.jacfwd(R.cov)(low), 0.0, atol=1e-30)
+    np.testing.assert_allclose(np.diag(R.cov(high)), np.exp(10) + np.array([1e-4, 4.0]), rtol=rtol(dtype))
+
+
+def test_the_density_of_white_acceleration_is_tuned_through_van_loan():
+    """Q is linear in the density: its derivative by the log-standard-deviation is 2 Q, and a likelihood has one too."""
+
+    def model(theta):
+        B = jnp.array([[0.0], [1.0]])
+        density = B @ jf.log_std.cov(theta["q"]) @ B.T
+        Q = jf.van_loan(jnp.array([[0.0, 1.0], [0.0, 0.0]]), density)
+        z = jf.Sensor(lambda x, c: x[:1], jf.const(jnp.eye(1)), jf.vector(1))
+        return jf.Model(lambda x, u, dt: jnp.stack([x[0] + dt * x[1], x[1]]), Q, jf.vector(2), {"z": z})
+
+    theta = {"q": jnp.array([-0.4])}
+    np.testing.assert_allclose(
+        jax.jacfwd(lambda t: model(t).Q(None, None, 0.7))(theta)["q"][..., 0],
+        2 * np.exp(-0.8) * np.array([[0.7**3 / 3, 0.7**2 / 2], [0.7**2 / 2, 0.7]]),
+        rtol=1e-12,
+    )
+    z = np.random.default_rng(0).normal(size=(6, 1)).cumsum(0)
+    log = jf.Log(np.full(6, 0.7), (), {"z": z}, {}, {})
+
+    @jax.jit
+    @jax.value_and_grad
+    def likelihood(theta):
+        return jf.log_likelihood(jf.kf(model(theta)), jf.Gaussian(jnp.zeros(2), jnp.eye(2)), log)
+
+    above, below = (likelihood({"q": theta["q"] + h})[0] for h in (1e-5, -1e-5))
+    slope = float(likelihood(theta)[1]["q"][0])
+    assert abs(slope) > 1e-3
+    assert slope == pytest.approx(float(above - below) / 2e-5, rel=1e-6)
+
+
 def test_a_block_is_where_it_was_said():
     R = jf.blocks((jf.log_std, 1), (jf.log_cholesky(2), 2))
     theta = (jnp.log(jnp.array([3.0])), jnp.array([0.0, 2.0, jnp.log(5.0)]))
@@ -216,8 +312,10 @@ NOT_COVARIANCES = {
         ("cov", jf.log_std.theta),
         ("cov", jf.log_cholesky(2).theta),
         ("cov", jf.blocks((jf.log_std, 2)).theta),
+        ("cov", shared(2).theta),
+        ("cov", floored(jf.log_std, 0.1).theta),
     ],
-    ids=["const", "white", "van_loan", "log_std", "log_cholesky", "blocks"],
+    ids=["const", "white", "van_loan", "log_std", "log_cholesky", "blocks", "shared", "floored"],
 )
 def test_what_is_no_covariance_is_refused(name, use, bad, text):
     with pytest.raises(ValueError, match=text) as caught:
@@ -244,3 +342,22 @@ def test_other_complaints():
         jf.blocks((jf.log_std, 1), (jf.log_cholesky(2), 2)).theta(jnp.eye(2))
     with pytest.raises(ValueError, match=r"theta: expected a tuple of 2, one for each block, got 1"):
         jf.blocks((jf.log_std, 1), (jf.log_std, 1)).cov((jnp.zeros(1),))
+    with pytest.raises(ValueError, match=r"shared\(n\): expected at least 1, got 0"):
+        shared(0)
+    with pytest.raises(ValueError, match=r"theta: expected one number, got shape \(2,\)"):
+        shared(2).cov(jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"cov: expected a positive variance, got 0"):
+        shared(2).theta(jnp.zeros((2, 2)))
+    for bad in (-0.1, np.nan, np.inf, np.array([0.1, -1.0])):
+        with pytest.raises(ValueError, match=r"floored\(std\): expected finite numbers >= 0, got"):
+            floored(jf.log_std, bad)
+    with pytest.raises(ValueError, match=r"floored\(std\): expected one number or shape \(3,\), got \(2,\)"):
+        floored(jf.log_std, np.ones(2)).cov(jnp.zeros(3))
+
+
+def test_what_is_below_the_floor_has_no_theta():
+    R = floored(jf.log_cholesky(2), 1.0)
+    for below in (np.diag([0.5, 4.0]), np.diag([1.0, 4.0]), np.array([[2.0, 1.5], [1.5, 3.0]])):
+        with pytest.raises(ValueError, match=r"cov: expected one above the floor, variances 1.0, got"):
+            R.theta(jnp.asarray(below))
+    np.testing.assert_allclose(R.cov(R.theta(jnp.diag(jnp.array([1.1, 4.0])))), np.diag([1.1, 4.0]), rtol=1e-12)

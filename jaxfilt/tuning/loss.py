@@ -1,0 +1,126 @@
+"""The loss of many runs and its gradient, as one compiled program; a run that diverges harms no other."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxfilt.chunk import CPU_OPTIONS
+from jaxfilt.fold import Objective, View, fold
+from jaxfilt.tuning.parameters import Parameters
+from jaxfilt.tuning.split import Case
+from jaxfilt.types import Array, Filter, Gaussian, PyTree, Space
+
+PENALTY = 1e6
+"""What the loss grows by if all runs diverge: more than any step could gain, and finite."""
+
+
+class Problem(NamedTuple):
+    """What is tuned, all but the data: functions of theta, and how its numbers become one."""
+
+    objective: Objective
+    filter: Callable[[PyTree], Filter]
+    beliefs: tuple[Callable[[PyTree], Gaussian], ...]
+    parameters: Parameters
+    space: Space
+    view: View
+    prior: Callable[[PyTree], Array] | None = None
+    segment: int | None = None
+
+
+class Evaluated(NamedTuple):
+    """For each of S parameter vectors: the ``loss`` (S,), its ``gradient`` (S, p), the runs' sums (S, R, ...), their
+    shares of the gradient ``by_run`` (S, R, p), and which runs were ``sound`` (S, R)."""
+
+    loss: jax.Array
+    gradient: jax.Array
+    sums: dict[str, jax.Array]
+    by_run: jax.Array
+    sound: jax.Array
+
+
+Program = Callable[[Array, Case, Any], Evaluated]
+
+
+def losses(
+    problem: Problem, data: Case, axes: Case, starts: int = 1, begin: Any = None, gradient: bool = True
+) -> Program:
+    """The program (V (S, p), data, begin) -> `Evaluated`, compiled for data of this shape, taken `apart`.
+
+    ``begin``: of pieces of runs, what they go on from: beliefs (S, R, ...). Without ``gradient`` it is cheaper, and
+    gradient and by_run are 0.
+    """
+
+    def evaluated(v: Array, data: Case, begin: Gaussian | None) -> Evaluated:
+        return _evaluated(problem, v, data, begin, axes, gradient)
+
+    def every(V: Array, data: Case, begin: Gaussian | None) -> Evaluated:
+        return jax.vmap(evaluated, in_axes=(0, None, 0))(V, data, begin)
+
+    V = jax.ShapeDtypeStruct((starts, len(problem.parameters.start)), data.log.dt.dtype)
+    return compiled(every, V, data, begin)
+
+
+def compiled(function: Callable, *arguments: Any) -> Any:
+    """A function, compiled for arguments of these shapes; on a CPU without Eigen's threads, which cost more than they
+    bring to thousands of small products."""
+    lowered = jax.jit(function).lower(*arguments)
+    if jax.default_backend() == "cpu":
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # an XLA that does not know the option
+            return lowered.compile(compiler_options=CPU_OPTIONS)
+    return lowered.compile()
+
+
+def started(problem: Problem, theta: PyTree, case: Case) -> Gaussian:
+    """The belief in which one run starts."""
+    dtype = case.log.dt.dtype
+    each = [jax.tree.map(lambda a: jnp.asarray(a, dtype), belief(theta)) for belief in problem.beliefs]
+    return jax.tree.map(lambda *a: jnp.stack(a)[case.run], *each) if len(each) > 1 else each[0]
+
+
+def _sums(problem: Problem, v: Array, case: Case, begin: Gaussian | None) -> dict[str, jax.Array]:
+    """Those of one run, or of a piece of one."""
+    theta = problem.parameters.tree(v)
+    start, filter = started(problem, theta, case), problem.filter(theta)
+    if begin is not None and case.first is not None:
+        first = jnp.asarray(case.first)
+        start = jax.tree.map(lambda a, b: jnp.where(first, a, b), start, begin)
+    truth, weight = case.truth, case.weight
+    return fold(problem.objective, filter, start, case.log, truth, weight, problem.space, problem.view, problem.segment)
+
+
+def _evaluated(problem: Problem, v: Array, data: Case, begin: Gaussian | None, axes: Case, gradient: bool) -> Evaluated:
+    runs = len(data.run)
+    # Each run has parameters of its own, all alike: so its share of the gradient comes out apart, and that of a run
+    # that diverged, NaN, can be left out. (A sum over runs of which one is NaN is NaN, whatever is selected before.)
+    V = jnp.broadcast_to(v, (runs, len(v)))
+    every = jax.vmap(lambda v, case, begin: _sums(problem, v, case, begin), in_axes=(0, axes, 0))
+    sums, pull = jax.vjp(lambda V: every(V, data, begin), V) if gradient else (every(V, data, begin), None)
+    sound = jnp.stack([jnp.isfinite(s.reshape(runs, -1)).all(1) for s in sums.values()]).all(0)
+    picked = {name: jnp.where(_like(sound, s), s, 0.0) for name, s in sums.items()}
+    total = {name: s.sum(0) for name, s in picked.items()}
+    loss, slope = jax.value_and_grad(problem.objective.loss)(total)
+    loss += PENALTY * (1 - sound.mean(dtype=loss.dtype))
+    by_run = jnp.zeros_like(V)
+    if pull is not None:
+        cotangent = {
+            name: jnp.where(_like(sound, s), jnp.broadcast_to(slope[name], s.shape), 0.0) for name, s in sums.items()
+        }
+        (by_run,) = pull(cotangent)
+        sound &= jnp.isfinite(by_run).all(1)
+        by_run = jnp.where(sound[:, None], by_run, 0.0)
+    whole = by_run.sum(0)
+    prior = problem.prior
+    if prior is not None:
+        log_density, ascent = jax.value_and_grad(lambda v: prior(problem.parameters.tree(v)))(v)
+        count = jnp.maximum(total["count"], 1.0)
+        loss, whole = loss - log_density / count, whole - ascent / count
+    return Evaluated(loss, whole, picked, by_run, sound)
+
+
+def _like(flags: Array, array: Array) -> jax.Array:
+    return flags.reshape(flags.shape + (1,) * (array.ndim - 1))
