@@ -8,14 +8,14 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxfilt import files, mismatch, recordings, scenarios
+from jaxfilt import datasets, files, mismatch, recordings, scenarios, theta_file
 from jaxfilt.filters import ckf, ekf, iekf, kf, ukf
 from jaxfilt.types import Filter, Model, PyTree, Replay, Scenario
 
@@ -26,10 +26,20 @@ class Mistake(Exception):
     """Something that the user can mend, said in one line."""
 
 
-def at_least(least: int, **named: int) -> None:
+def at_least(least: int, **named: float) -> None:
     for name, value in named.items():
         if value < least:
             raise Mistake(f"--{name}: expected at least {least}, got {value}")
+
+
+def one_of(option: str, value: str, choices: Iterable[str]) -> None:
+    if value not in choices:
+        raise Mistake(f"--{option}: expected one of {', '.join(filter(None, choices))}, got {value!r}")
+
+
+def listed(text: str) -> list[str]:
+    """Names with commas between them."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def makers(filters: str) -> dict[str, Callable[..., Filter]]:
@@ -38,6 +48,25 @@ def makers(filters: str) -> dict[str, Callable[..., Filter]]:
         if name not in FILTERS:
             raise Mistake(f"--filter: expected some of {', '.join(FILTERS)}, got {name!r}")
     return {name: FILTERS[name] for name in chosen}
+
+
+def maker(filter: str) -> Callable[..., Filter]:
+    one_of("filter", filter, FILTERS)
+    return FILTERS[filter]
+
+
+def clip(text: str) -> float | dict[str, float] | None:
+    """``2`` or ``q=1,gnss=0.5``: the largest norm of the gradient, or of the parts that these names begin."""
+    limits: dict[str, float] = {}
+    for part in listed(text):
+        name, _, value = part.rpartition("=")
+        try:
+            limits[name] = float(value)
+        except ValueError:
+            limits[name] = np.nan
+    if not all(0 < limit < np.inf for limit in limits.values()) or ("" in limits and len(limits) > 1):
+        raise Mistake(f"--clip: expected a norm above 0, or NAME=NORM with commas between, got {text!r}")
+    return limits.get("", limits) or None
 
 
 def noise_factors(texts: list[str], option: str) -> dict[str, list[float]]:
@@ -131,16 +160,30 @@ def writable(out: str) -> Path:
     return folder
 
 
-def scenario(target: str) -> tuple[Scenario, Path | None, str]:
+def theta(path: str, like: PyTree) -> PyTree:
+    """The parameters in a file, in the structure of these; these themselves without a path."""
+    if not path:
+        return like
+    try:
+        return theta_file.theta_from_json(Path(path).read_text(), like)
+    except OSError as error:
+        raise Mistake(f"--theta: cannot read {path}: {error.strerror}") from None
+    except ValueError as error:
+        raise Mistake(f"--theta {path}: {line(error)}") from None
+
+
+def scenario(target: str, command: str = "study") -> tuple[Scenario, Path | None, str]:
     """The scenario, the user's file that it is from, and a name for it."""
+    kinds = "a scenario" if command == "study" else "a scenario or a recording"
     if not target:
-        raise Mistake("study: expected a scenario; jaxfilt study --list shows them")
+        raise Mistake(f"{command}: expected {kinds}; jaxfilt {command} --list shows them")
     if ":" in target or target.endswith(".py"):
         return _own_scenario(target)
     try:
         return scenarios.scenario(target), None, target
     except KeyError as unknown:
-        raise Mistake(f"{unknown.args[0]}; your own is FILE.py:NAME") from None
+        known = "" if command == "study" else f"; or a recording of {', '.join(recordings.names())}"
+        raise Mistake(f"{unknown.args[0]}{known}; your own is FILE.py:NAME") from None
 
 
 def _own_scenario(target: str) -> tuple[Scenario, Path, str]:
@@ -199,6 +242,26 @@ def replay(recording: str, log: str, sequence: str) -> tuple[Replay, Path | None
     except (KeyError, FileNotFoundError) as error:
         raise Mistake(line(error)) from None
     return chosen, None, f"{recording}-{sequence}" if sequence else recording
+
+
+def recorded(name: str, train: list[str], test: list[str]) -> tuple[dict[str, Replay], dict[str, Replay]]:
+    """Sequences of a recording by name, to learn from and to report on.
+
+    Of nothing said, the last is reported on; of a test alone, all others are learned from; of a training alone, nothing
+    is reported on but a part of its own time.
+    """
+    every = datasets.sequences(name)
+    if not train and not test and len(every) > 1:
+        test = [every[-1]]
+    train = train or [sequence for sequence in every if sequence not in test]
+    both = [sequence for sequence in train if sequence in test]
+    if both or not train:
+        raise Mistake(f"--test-sequence: expected others than those to learn from, got {', '.join(both or test)}")
+    try:
+        first, second = ({sequence: recordings.replay(name, sequence) for sequence in part} for part in (train, test))
+    except (KeyError, FileNotFoundError) as error:
+        raise Mistake(line(error)) from None
+    return first, second
 
 
 @contextlib.contextmanager

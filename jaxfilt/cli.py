@@ -1,37 +1,27 @@
-"""The command line: ``jaxfilt study`` and ``jaxfilt replay``. The only room that touches argv and global settings."""
+"""The command line: ``jaxfilt study``, ``jaxfilt replay`` and, in a file of its own, ``jaxfilt tune``."""
 
 from __future__ import annotations
 
 import functools
-import shlex
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import jax
 
 from jaxfilt import arguments as asked
-from jaxfilt import checkpoint, datasets, recordings, report, scenarios, terminal
+from jaxfilt import checkpoint, datasets, recordings, scenarios, terminal
 from jaxfilt.arguments import Mistake, explained
 from jaxfilt.bound import Bound, cramer_rao
-from jaxfilt.review import Replayed, replayed
+from jaxfilt.cli_tune import tune
+from jaxfilt.command import MISSING, built, finish, kept, one_of, typed, typer
+from jaxfilt.review import replayed
 from jaxfilt.study import Interrupted, Study
 from jaxfilt.study import study as monte_carlo
 from jaxfilt.sweep import Sweep
 from jaxfilt.sweep import sweep as many_studies
 from jaxfilt.types import Filter, Gaussian, Log, Model, PyTree, Scenario
-
-MISSING: str | None = None
-if TYPE_CHECKING:
-    import typer
-else:
-    try:
-        import rich  # noqa: F401
-        import typer
-    except ModuleNotFoundError as missing:  # the extra `cli` is not installed: `main` says so
-        MISSING = missing.name
 
 BOUND_RUNS = 200
 """Simulated truths that the Cramer-Rao bound is averaged over."""
@@ -64,6 +54,7 @@ def app() -> typer.Typer:
     commands.callback(invoke_without_command=True)(_jaxfilt)
     commands.command()(study)
     commands.command()(replay)
+    commands.command()(tune)
     return commands
 
 
@@ -96,6 +87,9 @@ def study(
         ),
     ] = None,
     bound: Annotated[bool, typer.Option(help="Compare with the Cramer-Rao bound.")] = True,
+    theta: Annotated[
+        str, typer.Option(help="theta.json of jaxfilt tune: what the filters assume; the truth stays as it is.")
+    ] = "",
     dtype: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
     chunk: Annotated[int, typer.Option(help="Runs at once; default by memory.")] = 0,
     out: Annotated[str, typer.Option(help="Folder for the results; default jaxfilt-out/study-NAME.")] = "",
@@ -113,6 +107,7 @@ def study(
     over = asked.noise_factors(sweep or [], "--sweep")
     asked.set_dtype(dtype)
     chosen, source, label = asked.scenario(scenario)
+    assumed = asked.theta(theta, chosen.theta)
     folder = asked.writable(out or f"jaxfilt-out/study-{label}")
     bank = {name: functools.partial(_assuming, make, chosen.model) for name, make in makers.items()}
     log, key = chosen.schedule(steps), jax.random.key(seed)
@@ -132,17 +127,17 @@ def study(
         # The bound is of the truth's own model and noise, and compiles while the study does.
         wanted = bound and not over and not corrupt
         limit = beside.submit(_bound, chosen, log, key) if wanted else None
-        result, interrupted = _simulated(robot, chosen.theta, believed, over, options)
+        result, interrupted = _simulated(robot, assumed, chosen.theta, believed, over, options)
         least = limit.result() if limit and not interrupted else None
-    done = _one_of(result).runs
+    done = one_of(result).runs
     title = f"{label}: {done:,} runs of {steps:,} steps, {dtype}, seed {seed}"
     if isinstance(result, Sweep):
         terminal.show_sweep(result, title)
     else:
         terminal.show_study(result, title, least)
-    _finish(result, folder, label, least)
+    finish(result, folder, label, least)
     if interrupted:
-        print(f"interrupted after {done:,} of {runs:,} runs; go on with: {_command()} --resume", file=sys.stderr)
+        print(f"interrupted after {done:,} of {runs:,} runs; go on with: {typed()} --resume", file=sys.stderr)
     return 130 if interrupted else 0
 
 
@@ -153,7 +148,12 @@ def _bound(chosen: Scenario, log: Log, key: Any) -> Bound:
 
 
 def _simulated(
-    robot: tuple, theta: PyTree, believed: dict[str, float], over: dict[str, list[float]], options: dict[str, Any]
+    robot: tuple,
+    theta: PyTree,
+    truth_theta: PyTree,
+    believed: dict[str, float],
+    over: dict[str, list[float]],
+    options: dict[str, Any],
 ) -> tuple[Study | Sweep, bool]:
     """The study, or the sweep of studies, and whether it was interrupted."""
 
@@ -162,12 +162,12 @@ def _simulated(
 
     try:
         if over:
-            return many_studies(*robot, over=over, theta=assumed, truth_theta=theta, **options), False
-        return monte_carlo(*robot, theta=assumed(), truth_theta=theta, **options), False
+            return many_studies(*robot, over=over, theta=assumed, truth_theta=truth_theta, **options), False
+        return monte_carlo(*robot, theta=assumed(), truth_theta=truth_theta, **options), False
     except Interrupted as stopped:
         return stopped.result, True
     except OSError as error:
-        raise Mistake(_kept(error)) from None
+        raise Mistake(kept(error)) from None
     except ValueError as error:
         if "cannot resume" not in str(error):
             raise
@@ -185,6 +185,7 @@ def replay(
         str,
         typer.Option(help="Probability with which a true reading passes, or none; default the recording's own."),
     ] = "",
+    theta: Annotated[str, typer.Option(help="theta.json of jaxfilt tune: the parameters to use.")] = "",
     dtype: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
     out: Annotated[str, typer.Option(help="Folder for the results; default jaxfilt-out/replay-NAME.")] = "",
     names: Annotated[bool, typer.Option("--list", help="List the recordings and their sequences and exit.")] = False,
@@ -196,13 +197,14 @@ def replay(
     makers, threshold = asked.makers(filters), asked.gate(gate, recording)
     asked.set_dtype(dtype)
     chosen, source, label = asked.replay(recording, log, sequence)
+    assumed = asked.theta(theta, chosen.theta)
     folder = asked.writable(out or f"jaxfilt-out/replay-{label}")
-    bank = {name: functools.partial(_built, make, chosen.model, threshold) for name, make in makers.items()}
+    bank = {name: functools.partial(built, make, chosen.model, threshold) for name, make in makers.items()}
     with explained(source), terminal.progress_bar():
-        result = replayed(chosen, bank)
+        result = replayed(chosen, bank, theta=assumed)
     gated = "no gate" if threshold is None else f"gate {threshold:g}"
     terminal.show_replay(result, f"{label}: {len(result.t):,} rows, {dtype}, {gated}", threshold is not None)
-    _finish(result, folder, label, None)
+    finish(result, folder, label)
 
 
 def _assuming(make: Callable[..., Filter], model: Callable[[PyTree], Model], theta: PyTree) -> Filter:
@@ -212,39 +214,3 @@ def _assuming(make: Callable[..., Filter], model: Callable[[PyTree], Model], the
 
 def _believed(belief: Callable[[PyTree], Gaussian], theta: PyTree) -> Gaussian:
     return belief(theta["robot"])
-
-
-def _built(make: Callable[..., Filter], model: Callable[[PyTree], Model], gate: float | None, theta: PyTree) -> Filter:
-    return make(model(theta), gate=gate)
-
-
-def _kept(error: OSError) -> str:
-    """What hinders a study from keeping its state."""
-    if isinstance(error, FileExistsError):
-        return f"{error}; go on with: {_command()} --resume"
-    return f"{error.filename}: {error.strerror}" if error.filename else asked.line(error)
-
-
-def _command() -> str:
-    """The command that makes the same again."""
-    return shlex.join(["jaxfilt", *[word for word in sys.argv[1:] if word != "--resume"]])
-
-
-def _one_of(result: Study | Sweep | Replayed) -> Any:
-    """The result, or the first study of a sweep: how long it took, and of how many runs it is, all share."""
-    return result.studies.flat[0] if isinstance(result, Sweep) else result
-
-
-def _finish(result: Study | Sweep | Replayed, folder: Path, label: str, bound: Bound | None) -> None:
-    try:
-        report.write(result, folder, label, bound=bound, command=_command())
-    except ModuleNotFoundError as missing:
-        raise Mistake(asked.line(missing)) from None
-    except OSError as error:
-        raise Mistake(f"{folder}: cannot write the results: {error.strerror}") from None
-    timed = _one_of(result)
-    print(
-        f"compile {timed.compile_seconds:.1f} s, run {timed.run_seconds:.1f} s; "
-        f"bounds hold {100 * timed.confidence:g} % of the time"
-    )
-    print(f"written: {', '.join(str(folder / name) for name in report.files(result))}")

@@ -21,6 +21,7 @@ from jaxfilt.types import Status
 from jaxfilt.verdict import Verdict
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
     from rich.table import Table
 
 COLOURS = {"inside": "green", "above": "red", "below": "yellow", "unknown": "dim"}
@@ -29,6 +30,31 @@ COLOURS = {"inside": "green", "above": "red", "below": "yellow", "unknown": "dim
 @contextlib.contextmanager
 def progress_bar() -> Iterator[Callable[[int, int], None]]:
     """A spinner while it compiles, a bar while it runs; on stderr, and only where somebody looks."""
+    with _bar() as (bar, task):
+
+        def progress(done: int, total: int) -> None:
+            speed = bar.tasks[task].speed
+            rate = f", {speed:,.0f} runs/s" if speed else ""
+            bar.update(task, description=f"{done:,} of {total:,} runs{rate}", completed=done, total=total)
+
+        yield progress
+
+
+@contextlib.contextmanager
+def tuning_bar() -> Iterator[Callable[[int, int, float, float], None]]:
+    """The same for the steps of a tuning, with the loss and that of the validation part."""
+    with _bar() as (bar, task):
+
+        def progress(step: int, steps: int, loss: float, validation: float) -> None:
+            held = f", validation {validation:.5g}" if np.isfinite(validation) else ""
+            text = f"step {step:,} of at most {steps:,}: loss {loss:.5g}{held}"
+            bar.update(task, description=text, completed=step, total=steps)
+
+        yield progress
+
+
+@contextlib.contextmanager
+def _bar() -> Iterator[tuple[Progress, TaskID]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -42,14 +68,7 @@ def progress_bar() -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("compiling", total=None)
-
-        def progress(done: int, total: int) -> None:
-            speed = bar.tasks[task].speed
-            rate = f", {speed:,.0f} runs/s" if speed else ""
-            bar.update(task, description=f"{done:,} of {total:,} runs{rate}", completed=done, total=total)
-
-        yield progress
+        yield bar, bar.add_task("compiling", total=None)
 
 
 def show(what: Any) -> None:

@@ -1,4 +1,4 @@
-"""The figures of a study, a sweep or a replay: one overview, and those of the page as vector graphics."""
+"""The figures of a study, a sweep, a replay or a tuning: one overview, and those of the page as vector graphics."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfilt.bound import Bound
-from jaxfilt.report import replay_figures, study_figures, sweep_figures
+from jaxfilt.fit import Fit
+from jaxfilt.report import replay_figures, study_figures, sweep_figures, tune_figures
 from jaxfilt.report.drawing import MANY_POINTS, Picture
 from jaxfilt.review import Replayed
 from jaxfilt.study import Study
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def overview(result: Study | Sweep | Replayed, name: str = "", bound: Bound | None = None) -> Figure:
+def overview(result: Study | Sweep | Replayed | Fit, name: str = "", bound: Bound | None = None) -> Figure:
     """All that matters in one picture.
 
     Raises:
@@ -26,10 +27,12 @@ def overview(result: Study | Sweep | Replayed, name: str = "", bound: Bound | No
     """
     if isinstance(result, Study):
         return study_figures.overview(result, name, bound)
+    if isinstance(result, Fit):
+        return tune_figures.overview(result, name)
     return sweep_figures.overview(result, name) if isinstance(result, Sweep) else replay_figures.overview(result, name)
 
 
-def pictures(result: Study | Sweep | Replayed, bound: Bound | None = None) -> list[Picture]:
+def pictures(result: Study | Sweep | Replayed | Fit, bound: Bound | None = None) -> list[Picture]:
     """The figures of the page, in their order.
 
     Raises:
@@ -37,6 +40,8 @@ def pictures(result: Study | Sweep | Replayed, bound: Bound | None = None) -> li
     """
     if isinstance(result, Study):
         return study_figures.figures(result, bound)
+    if isinstance(result, Fit):
+        return tune_figures.figures(result)
     return sweep_figures.figures(result) if isinstance(result, Sweep) else replay_figures.figures(result)
 
 

@@ -15,10 +15,13 @@ from typing import Any
 
 from jaxfilt.bound import Bound
 from jaxfilt.findings import count
-from jaxfilt.report import figures
+from jaxfilt.fit import Fit
+from jaxfilt.report import figures, tune_summary, tune_tables
+from jaxfilt.report.cells import BAD, GOOD, SO_SO, Card, Cell, Table
 from jaxfilt.report.drawing import Picture
 from jaxfilt.report.summary import REPLAY, SWEEP, summary
-from jaxfilt.report.tables import BAD, GOOD, SO_SO, Card, Cell, Table, cards, tables
+from jaxfilt.report.tables import cards, tables
+from jaxfilt.report.tune_summary import TUNE
 from jaxfilt.review import Replayed
 from jaxfilt.study import Study
 from jaxfilt.sweep import Sweep
@@ -30,11 +33,11 @@ WIDE = 40
 """Characters from which on a cell is broken into lines."""
 
 
-def page(result: Study | Sweep | Replayed, name: str = "", bound: Bound | None = None, command: str = "") -> str:
-    """The report of a study, a sweep or a replay as one HTML file.
+def page(result: Study | Sweep | Replayed | Fit, name: str = "", bound: Bound | None = None, command: str = "") -> str:
+    """The report of a study, a sweep, a replay or a tuning as one HTML file.
 
     Args:
-        result: from `jaxfilt.study`, `jaxfilt.sweep` or `jaxfilt.replayed`.
+        result: from `jaxfilt.study`, `jaxfilt.sweep`, `jaxfilt.replayed` or `jaxfilt.tune`.
         name: of what was studied.
         bound: from `jaxfilt.cramer_rao`, of a study.
         command: what to type to get the same again.
@@ -42,25 +45,32 @@ def page(result: Study | Sweep | Replayed, name: str = "", bound: Bound | None =
     Raises:
         ModuleNotFoundError: matplotlib is missing; the text says how to get it.
     """
-    return rendered(summary(result, name, bound, command), figures.pictures(result, bound))
+    tuned = isinstance(result, Fit)
+    found = tune_summary.summary(result, name, command) if tuned else summary(result, name, bound, command)
+    return rendered(found, figures.pictures(result, bound))
 
 
 def rendered(found: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
     """The page of a summary and its pictures."""
     found = dict(found)
-    kind = {SWEEP: "sweep", REPLAY: "replay"}.get(found["schema"], "study")
+    kind = {SWEEP: "sweep", REPLAY: "replay", TUNE: "tuning"}.get(found["schema"], "study")
     title = found["name"] or kind
     style, script = (
         importlib.resources.files("jaxfilt.report").joinpath(f"page.{part}").read_text() for part in ("css", "js")
     )
-    verdicts = "".join(map(_card, cards(found)))
+    tuned = kind == "tuning"
+    verdicts = "".join(map(_card, tune_tables.cards(found) if tuned else cards(found)))
+    told = "".join(f"<li>{_text(text)}</li>" for text in found.get("findings", ()))
+    notices = f"<ol class='findings'>{told}</ol>" if told else ""
     about = f"<p class='quiet'>{_text(_about(found, kind))}</p>{_unfinished(found)}"
+    made = tune_tables.tables(found) if tuned else tables(found)
     parts = [
         f"<header><h1>{_text(title)}</h1>{about}</header>",
         "<main>",
-        _section("Verdicts", f"<ul class='cards'>{verdicts}</ul>"),
+        _section("Findings" if tuned else "Verdicts", f"<ul class='cards'>{verdicts}</ul>{notices}"),
         _section("Figures", f"<div class='figures'>{''.join(map(_figure, pictures))}</div>"),
-        _section("Tables", "<p class='quiet'>Press a column's name to sort by it.</p>", *map(_table, tables(found))),
+        _section("Tables", "<p class='quiet'>Press a column's name to sort by it.</p>", *map(_table, made)),
+        _section("Matrices", *_matrices(found)) if tuned else "",
         _section("Settings", _settings(found)),
         _again(found),
         "</main>",
@@ -97,6 +107,9 @@ def _text(text: Any) -> str:
 
 def _about(found: Mapping[str, Any], kind: str) -> str:
     s = found["settings"]
+    if kind == "tuning":
+        runs = f"{count(s['runs'], 'run')}, {s['split']}"
+        return f"Tuned by {s['objective']} with {s['optimizer']}; {runs}; {s['dtype']}, seed {s['seed']}"
     if kind == "replay":
         return f"A recording of {s['steps']:,} rows, {s['dtype']}"
     runs = f"{count(s['runs'], 'run')} of {count(s['steps'], 'step')}, {s['dtype']}, seed {s['seed']}"
@@ -161,14 +174,30 @@ def _cell(cell: Cell, left: bool) -> str:
     return f"<td{style} {key}>{_text(cell.text)}</td>"
 
 
+def _matrices(found: Mapping[str, Any]) -> list[str]:
+    """Tuned covariances, to be read; the others folded away."""
+    made = []
+    for stage, named in tune_tables.matrices(dict(found)).items():
+        blocks = "".join(
+            f"<h3>{_text(name)}</h3><div class='scroll' tabindex='0' role='region' aria-label='{_text(name)}, "
+            f"{_text(stage)}'><pre class='matrix'>{_text(M)}</pre></div>"
+            for name, M in named.items()
+        )
+        made.append(blocks if not made else f"<details><summary>{_text(stage)}</summary>{blocks}</details>")
+    return made
+
+
 def _settings(found: Mapping[str, Any]) -> str:
     settings = dict(found["settings"])
     theta, truth = settings.pop("theta", {}), settings.pop("truth_theta", {})
-    settings["confidence"] = f"{100 * settings['confidence']:g} %"
+    if "confidence" in settings:
+        settings["confidence"] = f"{100 * settings['confidence']:g} %"
     over = {f"{name} (swept)": ", ".join(map(_short, values)) for name, values in found.get("over", {}).items()}
     parts = [_list(settings | over)]
     if theta:
         parts.append(f"<h3>Parameters that the filters assume</h3>{_list(theta)}")
+    if found.get("theta"):
+        parts.append(f"<h3>All parameters, tuned and frozen</h3>{_list(found['theta'])}")
     if truth and truth != theta:
         parts.append(f"<h3>Parameters of the truth</h3>{_list(truth)}")
     return "".join(parts)
@@ -181,7 +210,7 @@ def _list(items: Mapping[str, Any]) -> str:
 
 def _short(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(map(_short, value))
+        return ", ".join(map(_short, value)) or "none"
     if isinstance(value, float):
         return f"{value:.6g}"
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) and value < 1e12 else str(value)

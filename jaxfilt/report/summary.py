@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from jaxfilt import checkpoint, chisquare, consistency
+from jaxfilt import checkpoint, chisquare
 from jaxfilt.bound import Bound, efficiency
 from jaxfilt.consistency import Consistency
 from jaxfilt.metrics import Blocks, Whiteness
+from jaxfilt.report.plain import judged, plain
 from jaxfilt.review import Replayed, Review
 from jaxfilt.scores import STATE, Fault, Paired, Scores
 from jaxfilt.study import Study
@@ -20,8 +20,6 @@ from jaxfilt.verdict import Verdict
 
 STUDY, SWEEP, REPLAY = "jaxfilt.study/2", "jaxfilt.sweep/1", "jaxfilt.replay/2"
 """Schemas; the number grows when a field changes its meaning or goes away, not when one is added."""
-
-PARAMETERS = ("theta", "truth_theta", "over", "at")
 
 
 def summary(
@@ -87,7 +85,7 @@ def summary(
     else:
         found = _sweep(result) if isinstance(result, Sweep) else _replayed(result)
     schema = {Study: STUDY, Sweep: SWEEP, Replayed: REPLAY}[type(result)]
-    return _plain({"schema": schema, "name": name, "command": command, **found})
+    return plain({"schema": schema, "name": name, "command": command, **found})
 
 
 def component_names(blocks: Blocks, dim: int) -> list[str]:
@@ -163,7 +161,7 @@ def _review(r: Replayed, review: Review) -> dict[str, Any]:
     if review.nees_mean is not None and review.nees is not None:
         low, high = chisquare.bounds(r.confidence, r.space.dim)
         rows = Consistency(review.nees, r.space.dim, low, high)
-        state = {"nees": _test(review.nees_mean, rows)}
+        state = {"nees": judged(review.nees_mean, rows)}
     return {
         "diverged": review.diverged,
         "fault": _fault(review.fault),
@@ -171,7 +169,7 @@ def _review(r: Replayed, review: Review) -> dict[str, Any]:
         "state": state,
         "sensors": {
             sensor: {
-                "nis": _test(nis),
+                "nis": judged(nis),
                 "refused": review.refused[sensor],
                 "whiteness": _white(review.whiteness[sensor]),
             }
@@ -199,25 +197,25 @@ def _filter(s: Study, name: str, bound: Bound | None) -> dict[str, Any]:
                 "claimed": _root_mean(c.claimed[block]),
                 "worst": c.worst[block],
                 "efficiency": efficient.get(block),
-                "nees": _test(c.nees_total[block], c.nees[block]),
+                "nees": judged(c.nees_total[block], c.nees[block]),
             }
             for block, (_, unit) in s.blocks.items()
         },
         "state": {
-            "nees": _test(c.nees_total[STATE], c.nees[STATE]),
+            "nees": judged(c.nees_total[STATE], c.nees[STATE]),
             "log_score": c.log_score_total,
-            "coverage": {str(level): _test(c.coverage_total[level], c.coverage[level]) for level in c.coverage},
+            "coverage": {str(level): judged(c.coverage_total[level], c.coverage[level]) for level in c.coverage},
             "noncredibility": _mean(c.noncredibility),
             "inclination": _mean(c.inclination),
             "efficiency": efficient.get("total"),
         },
         "components": {
-            component: {"normalised_error": _test(test)}
-            for component, test in zip(component_names(s.blocks, s.space.dim), normalised, strict=True)
+            component: {"normalised_error": judged(error)}
+            for component, error in zip(component_names(s.blocks, s.space.dim), normalised, strict=True)
         },
         "sensors": {
             sensor: {
-                "nis": _test(c.nis_total[sensor], c.nis[sensor]),
+                "nis": judged(c.nis_total[sensor], c.nis[sensor]),
                 "refused": c.refused[sensor],
                 "whiteness": _white(c.whiteness[sensor]),
             }
@@ -228,7 +226,7 @@ def _filter(s: Study, name: str, bound: Bound | None) -> dict[str, Any]:
 
 
 def _kept(c: Scores) -> dict[str, Any]:
-    nees = {block: _test(total) for block, total in c.nees_total.items()}
+    nees = {block: judged(total) for block, total in c.nees_total.items()}
     return {"runs": c.runs, "rmse": c.rmse_total, "nees": nees}
 
 
@@ -270,13 +268,6 @@ def squared(unit: str) -> str:
     return f"({unit})^2" if "/" in unit or " " in unit else f"{unit}^2" if unit else ""
 
 
-def _test(total: Consistency, steps: Consistency | None = None) -> dict[str, Any]:
-    """A mean beside its expectation and bounds; over time too, where there are steps."""
-    ratio = total.mean / total.expected if total.expected else None
-    found = total._asdict() | {"ratio": ratio, "verdict": consistency.verdict(total)}
-    return found if steps is None else found | {"share_inside": consistency.share_inside(steps)}
-
-
 def _series(c: Consistency) -> dict[str, Any]:
     return {"mean": c.mean, "expected": c.expected, "low": c.low, "high": c.high}
 
@@ -301,18 +292,3 @@ def _mean(a: np.ndarray) -> float:
 
 def _root_mean(a: np.ndarray) -> float:
     return math.sqrt(_mean(np.asarray(a) ** 2))
-
-
-def _plain(x: Any, digits: int = 6) -> Any:
-    """The same as JSON knows it; numbers to so many digits, parameters to all of theirs, NaN and inf as None."""
-    if hasattr(x, "_asdict"):
-        return _plain(x._asdict(), digits)
-    if isinstance(x, Mapping):
-        return {str(key): _plain(value, 17 if key in PARAMETERS else digits) for key, value in x.items()}
-    if isinstance(x, np.ndarray | np.generic):
-        return _plain(x.tolist(), digits)
-    if isinstance(x, (list, tuple)):
-        return [_plain(value, digits) for value in x]
-    if isinstance(x, float):
-        return float(f"{x:.{digits}g}") if math.isfinite(x) else None
-    return x

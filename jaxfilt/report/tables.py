@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
+from jaxfilt.report.cells import (
+    BAD,
+    GOOD,
+    NOTHING,
+    PLAIN,
+    SO_SO,
+    Card,
+    Cell,
+    Table,
+    estimate,
+    is_number,
+    label,
+    number,
+    ratio,
+)
 from jaxfilt.report.summary import REPLAY, SWEEP
-
-NOTHING = "\N{EN DASH}"
-"""In a cell whose number is unknown."""
-
-GOOD, BAD, SO_SO, PLAIN = "good", "bad", "so-so", ""
-"""How a cell or a verdict is coloured, beside its words."""
 
 FIRST = 12
 """How many diverged runs are named."""
-
-
-class Cell(NamedTuple):
-    """What is written, what it is sorted by (a number or a text, None last), and its colour."""
-
-    text: str
-    order: float | str | None = None
-    mood: str = PLAIN
-
-
-class Table(NamedTuple):
-    """A title, what it says in a sentence, the names of its columns, and rows of cells."""
-
-    title: str
-    text: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
-
-
-class Card(NamedTuple):
-    """A verdict: whose, in a word, in a sentence, the findings, and its colour."""
-
-    name: str
-    word: str
-    headline: str
-    findings: Sequence[str]
-    mood: str
 
 
 def cards(found: dict[str, Any]) -> list[Card]:
@@ -70,7 +51,7 @@ def _over_settings(found: dict[str, Any], name: str) -> Card:
 
 def _at(point: dict[str, Any]) -> str:
     return ", ".join(
-        f"{name} = {value:.4g}" if _number(value) else f"{name} = {value}" for name, value in point.items()
+        f"{name} = {value:.4g}" if is_number(value) else f"{name} = {value}" for name, value in point.items()
     )
 
 
@@ -86,38 +67,8 @@ def tables(found: dict[str, Any]) -> list[Table]:
     return [table for table in made if table.rows]
 
 
-def number(value: Any, unit: str = "", digits: int = 4) -> Cell:
-    """A number with its unit, sorted by its value."""
-    if not _number(value):
-        return Cell(NOTHING)
-    return Cell(f"{value:,.{digits}g}".replace("e-0", "e-").replace("e+0", "e+") + (f" {unit}" if unit else ""), value)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _label(text: str) -> Cell:
-    return Cell(text, text)
-
-
-def _estimate(estimate: dict[str, Any], unit: str = "") -> Cell:
-    """Value and standard error, to two digits of the error."""
-    value, error = estimate["value"], estimate["error"]
-    if not _number(value) or not _number(error):
-        return number(value, unit)
-    decimals = 1 - math.floor(math.log10(error)) if error > 0 else 4
-    form = f".{max(decimals, 0)}f" if decimals <= 6 else ".2e"
-    return Cell(f"{value:,{form}} \N{PLUS-MINUS SIGN} {error:,{form}}" + (f" {unit}" if unit else ""), value)
-
-
-def _ratio(value: Any) -> Cell:
-    """A number about 1, to two decimals where that is enough."""
-    return Cell(f"{value:.2f}", value) if _number(value) and 0.1 <= abs(value) < 100 else number(value, digits=3)
-
-
 def _share(value: Any) -> Cell:
-    return number(100 * value, "%", 3) if _number(value) else Cell(NOTHING)
+    return number(100 * value, "%", 3) if is_number(value) else Cell(NOTHING)
 
 
 def _test(test: dict[str, Any], relative: bool = True) -> list[Cell]:
@@ -126,7 +77,7 @@ def _test(test: dict[str, Any], relative: bool = True) -> list[Cell]:
     mean, low, high = (None if test[k] is None else test[k] / scale for k in ("mean", "low", "high"))
     bounds = Cell(NOTHING) if low is None or high is None else Cell(f"{low:.3g} to {high:.3g}", low)
     mood = {"inside": GOOD, "unknown": PLAIN}.get(test["verdict"], BAD)
-    shown = _ratio(mean) if relative else number(mean, digits=3)
+    shown = ratio(mean) if relative else number(mean, digits=3)
     return [shown, bounds, number(test["p"], digits=2), Cell(test["verdict"], test["verdict"], mood)]
 
 
@@ -144,7 +95,7 @@ def _blocks(found: dict[str, Any]) -> Table:
         columns += ["bound" if bound["exact"] else "approximate bound", "efficiency"]
     rows = []
     for name, block, b in _each(found, "blocks"):
-        row = [_label(name), _label(block), _estimate(b["rmse"], b["unit"]), number(b["claimed"], b["unit"])]
+        row = [label(name), label(block), estimate(b["rmse"], b["unit"]), number(b["claimed"], b["unit"])]
         row += [number(b["worst"]["value"], b["unit"]), number(b["worst"]["run"], digits=15)]
         if bound:
             row += [number(bound["rmse"][block], b["unit"]), _share(b["efficiency"])]
@@ -159,7 +110,7 @@ def _consistency(found: dict[str, Any]) -> Table:
     rows = []
     for name, f in found["filters"].items():
         tests = {"state": f["state"]["nees"]} | {block: b["nees"] for block, b in f["blocks"].items()}
-        rows += [[_label(name), _label(part), *_test(t), _share(t["share_inside"])] for part, t in tests.items()]
+        rows += [[label(name), label(part), *_test(t), _share(t["share_inside"])] for part, t in tests.items()]
     text = (
         "Average normalised estimation error squared (ANEES) over its expectation: above 1 the filter is "
         "overconfident. p: how probable so large a deviation is for a consistent filter."
@@ -181,7 +132,7 @@ def _sensors(found: dict[str, Any]) -> Table:
         white_cells = [number(known[0][0] if known else None, digits=2)]
         white_cells.append(Cell(f"{inside} of {len(known)}", inside, mood) if known else Cell(NOTHING))
         share = [] if found["schema"] == REPLAY else [_share(s["nis"]["share_inside"])]
-        row = [_label(name), _label(sensor), *_test(s["nis"]), *share, *white_cells]
+        row = [label(name), label(sensor), *_test(s["nis"]), *share, *white_cells]
         rows.append([*row, number(s["refused"], digits=15)])
     columns = _tested("ANIS", "sensor")[: -1 if found["schema"] == REPLAY else None]
     text = (
@@ -199,7 +150,7 @@ def _coverage(found: dict[str, Any]) -> Table:
             if t["low"] is not None and t["high"] is not None:
                 bounds = Cell(f"{100 * t['low']:.3g} to {100 * t['high']:.3g} %", t["low"])
             inside = _share(t["share_inside"])
-            rows.append([_label(name), _share(float(level)), _share(t["mean"]), bounds, p, verdict, inside])
+            rows.append([label(name), _share(float(level)), _share(t["mean"]), bounds, p, verdict, inside])
     text = "How many of the errors lie in the credible ellipsoid of a probability."
     return Table("Coverage", text, ["filter", "ellipsoid", "inside", "bounds", "p", "verdict", "steps inside"], rows)
 
@@ -209,8 +160,8 @@ def _overall(found: dict[str, Any]) -> Table:
     for name, f in found["filters"].items():
         s, d = f["state"], f["diverged"]
         lost = Cell(f"{d['runs']:,}", d["runs"], BAD if d["runs"] else GOOD)
-        scores = [_estimate(s["log_score"]), number(s["noncredibility"], "dB", 3), number(s["inclination"], "dB", 3)]
-        rows.append([_label(name), number(f["runs"], digits=15), lost, *scores])
+        scores = [estimate(s["log_score"]), number(s["noncredibility"], "dB", 3), number(s["inclination"], "dB", 3)]
+        rows.append([label(name), number(f["runs"], digits=15), lost, *scores])
     text = "Log score: mean of log N(error; 0, P), larger is better. Inclination above 0: overconfident."
     columns = ["filter", "runs scored", "diverged", "log score", "noncredibility", "inclination"]
     return Table("Overall", text, columns, rows)
@@ -219,7 +170,7 @@ def _overall(found: dict[str, Any]) -> Table:
 def _bias(found: dict[str, Any]) -> Table:
     rows = []
     for name, component, c in _each(found, "components"):
-        rows.append([_label(name), _label(component), *_test(c["normalised_error"], relative=False)])
+        rows.append([label(name), label(component), *_test(c["normalised_error"], relative=False)])
     text = "Mean of the errors over their claimed standard deviations: 0 if unbiased."
     return Table("Bias", text, ["filter", "component", "mean normalised error", "bounds", "p", "verdict"], rows)
 
@@ -230,19 +181,19 @@ def _paired(found: dict[str, Any]) -> Table:
         score = p["log_score"] | {"unit": ""}
         for what, e in [*p["square"].items(), ("log score", score)]:
             value, error = e["value"], e["error"]
-            z = value / error if _number(value) and _number(error) and error > 0 else None
+            z = value / error if is_number(value) and is_number(error) and error > 0 else None
             better = NOTHING
             if z is not None:
                 first_wins = (z > 0) == (e is score)
                 better = "neither, within 3 errors" if abs(z) < 3 else p["first" if first_wins else "second"]
-            difference = _label(f"{p['first']} \N{MINUS SIGN} {p['second']}")
+            difference = label(f"{p['first']} \N{MINUS SIGN} {p['second']}")
             rows.append(
                 [
                     difference,
-                    _label(what),
-                    _estimate(e, e["unit"].replace("^2", "\N{SUPERSCRIPT TWO}")),
+                    label(what),
+                    estimate(e, e["unit"].replace("^2", "\N{SUPERSCRIPT TWO}")),
                     Cell(NOTHING) if z is None else Cell(f"{z:.1f}", z),
-                    _label(better),
+                    label(better),
                 ]
             )
     text = "Differences in mean squared error by block and in log score, on the same noise, over runs neither lost."
@@ -261,7 +212,7 @@ def _faults(found: dict[str, Any]) -> Table:
         if fault is not None:
             what = f"run {fault['run']}, step {fault['step']}, sensor {fault['sensor']}: {fault['status']}"
             what += f" (faults in {fault['runs']:,} runs)"
-        rows.append([_label(name), Cell(which, float(lost)), _label(what)])
+        rows.append([label(name), Cell(which, float(lost)), label(what)])
     text = "Diverged: the last errors are impossible for a consistent filter, or a belief is no belief any more."
     return Table("Runs that went wrong", text, ["filter", "diverged", "first fault"], rows)
 
@@ -278,7 +229,7 @@ def _kept(found: dict[str, Any]) -> Table:
         for block, rmse in (f["kept"] or {"rmse": {}})["rmse"].items():
             unit, test = f["blocks"][block]["unit"], f["kept"]["nees"][block]
             runs = number(f["kept"]["runs"], digits=15)
-            rows.append([_label(name), _label(block), runs, _estimate(rmse, unit), *_test(test)])
+            rows.append([label(name), label(block), runs, estimate(rmse, unit), *_test(test)])
     columns = ["filter", "block", "runs", "RMSE", "ANEES / expected", "bounds", "p", "verdict"]
     return Table("Without the diverged runs", "The same over the runs that did not diverge.", columns, rows)
 
@@ -287,11 +238,11 @@ def _recorded_errors(found: dict[str, Any]) -> Table:
     rows = []
     for name, block, b in _each(found, "blocks"):
         value = number(b["rmse"], b["unit"])
-        rows.append([_label(name), _label(f"RMSE {block}"), value, Cell(NOTHING), Cell(NOTHING)])
+        rows.append([label(name), label(f"RMSE {block}"), value, Cell(NOTHING), Cell(NOTHING)])
     for name, f in found["filters"].items():
         if f["state"]:
             mean, bounds, _, verdict = _test(f["state"]["nees"])
-            rows.append([_label(name), _label("ANEES / expected"), mean, bounds, verdict])
+            rows.append([label(name), label("ANEES / expected"), mean, bounds, verdict])
     return Table(
         "Errors", "Against the truth, where it is known.", ["filter", "score", "value", "bounds", "verdict"], rows
     )
@@ -311,11 +262,11 @@ def _points(found: dict[str, Any]) -> Table:
     rows = []
     for point in found["points"]:
         for name, f in point["filters"].items():
-            at = [number(v) if _number(v) else _label(str(v)) for v in point["at"].values()]
-            errors = [_estimate(f["blocks"][block]["rmse"], unit) for block, unit in blocks.items()]
+            at = [number(v) if is_number(v) else label(str(v)) for v in point["at"].values()]
+            errors = [estimate(f["blocks"][block]["rmse"], unit) for block, unit in blocks.items()]
             mean, bounds, _, verdict = _test(f["state"]["nees"])
             lost = number(f["diverged"]["runs"], digits=15)
-            rows.append([*at, _label(name), _worst(point["verdicts"][name]), *errors, mean, bounds, verdict, lost])
+            rows.append([*at, label(name), _worst(point["verdicts"][name]), *errors, mean, bounds, verdict, lost])
     columns = [
         *over,
         "filter",
