@@ -36,6 +36,7 @@ from jaxfilt.simulate import Simulation, sample, simulate
 from jaxfilt.spaces import angle, product, rotate, rotate_back, scalar, so2, so3, so3_exp, so3_log, vector
 from jaxfilt.study import Interrupted, Study, study
 from jaxfilt.sweep import Sweep, sweep
+from jaxfilt.theta_file import theta_from_json, theta_to_json
 from jaxfilt.transforms import cubature, gauss_hermite, taylor, unscented
 from jaxfilt.tune import tune
 from jaxfilt.tuning.split import Split
@@ -154,6 +155,8 @@ __all__ = [
     "study",
     "sweep",
     "taylor",
+    "theta_from_json",
+    "theta_to_json",
     "to_xarray",
     "tune",
     "ukf",

@@ -108,7 +108,7 @@ def log_score(error: Array, cov: Array) -> jax.Array:
 
 def _score(e: Array, P: Array) -> tuple[jax.Array, jax.Array]:
     """``e' P^-1 e`` and ``log |P|``."""
-    return linalg.score(P, linalg.cholesky(jax.lax.stop_gradient(P)), e)
+    return linalg.score(P, linalg.cholesky(P), e)
 
 
 def rmse(error: Array, blocks: Blocks, mask: Array | None = None) -> dict[str, float]:

@@ -31,7 +31,8 @@ class Moments(NamedTuple):
 
     ``mean`` is a point of the output space, ``cov`` (m, m) the covariance of the image, ``cross`` (n, m)
     the covariance of x with it, and ``remainder(K)`` the (n, n) covariance of ``x - K g(x)``, computed as a
-    product so that it is positive semidefinite by construction. An expansion about ``mean + d`` (iterated filters)
+    product so that it is positive semidefinite by construction; it must be that of these cov and cross, for gradients
+    count on it. An expansion about ``mean + d`` (iterated filters)
     has as its mean g there, and ``shift`` = J d (m,), to be added to innovations; 0 otherwise.
     """
 

@@ -10,7 +10,7 @@ import pytest
 
 import jaxfilt as jf
 from jaxfilt import datasets, recordings
-from jaxfilt.recordings import bicycle, campus, wheels
+from jaxfilt.recordings import bicycle, campus, indoor, wheels
 
 pytestmark = [pytest.mark.data, pytest.mark.usefixtures("data")]
 
@@ -69,10 +69,11 @@ def position(name: str, sequences: tuple[str, ...], **how: Any) -> np.ndarray:
     return np.array([score["position"] for score in scores(name, sequences, **how)])
 
 
-def refused(name: str, sequences: tuple[str, ...]) -> np.ndarray:
-    """Share of the readings that the gate refused, by run; and no update may have gone wrong."""
-    (status,) = run(name, sequences).status.values()
-    assert status.max() <= jf.Status.GATED
+def refused(name: str, sequences: tuple[str, ...], sensor: str | None = None) -> np.ndarray:
+    """Share of a sensor's readings that the gate refused, by run; and no update may have gone wrong."""
+    statuses = run(name, sequences).status
+    assert max(s.max() for s in statuses.values()) <= jf.Status.GATED
+    status = statuses[next(iter(statuses)) if sensor is None else sensor]
     return (status == jf.Status.GATED).sum(1) / (status != jf.Status.ABSENT).sum(1)
 
 
@@ -165,6 +166,67 @@ def test_the_model_car_with_made_fixes():
     refused("dart_car", drives)
 
 
+FLIGHTS = ("circle_xy", "circle_xy_fast", "circle_xy_log30hz", "sine_xyz", "sine_xyz_log30hz")
+
+
+def of_the_others(flight: str) -> Any:
+    """Per-anchor bias and noise from the truth of the other four flights: medians, and robust deviations tripled."""
+    theta = dict(indoor.INDOOR_DRONE)
+    errors = [[] for _ in range(indoor.ANCHORS)]
+    for other in set(FLIGHTS) - {flight}:
+        data = datasets.load("crazyflie_uwb", other)
+        t, pos = data.truth["pos"]
+        for k in range(indoor.ANCHORS):
+            ranges = data.streams[f"range_{k + 1}"]
+            at = np.stack([np.interp(ranges.t, t, pos[:, i]) for i in range(3)], 1)
+            errors[k].append(ranges.z - np.linalg.norm(at - ranges.c, axis=1))
+    every = [np.concatenate(e) for e in errors]
+    bias = [np.median(e) for e in every]
+    std = [3 * 1.4826 * np.median(np.abs(e - b)) for e, b in zip(every, bias, strict=True)]
+    return theta | {"bias": tuple(map(float, bias)), "range": tuple(map(float, np.log(std)))}
+
+
+@pytest.mark.long
+def test_the_drone_among_anchors_gains_from_the_biases_of_the_other_flights():
+    error = position("crazyflie_uwb", FLIGHTS)
+    assert (error < 0.16).all()  # no bias, one noise
+    assert refused("crazyflie_uwb", FLIGHTS, "range_8").min() > 0.002
+    assert refused("crazyflie_uwb", FLIGHTS, "range_8").max() < 0.12
+    flight = "sine_xyz"
+    belief, log = recordings.batch([replayed("crazyflie_uwb", f) for f in FLIGHTS])
+    k = FLIGHTS.index(flight)
+    theta = jax.tree.map(jnp.asarray, of_the_others(flight))
+    means = program("crazyflie_uwb", "ekf")(theta, belief, log).mean
+    score = recordings.rmse(replayed("crazyflie_uwb", flight), jax.tree.map(lambda a: a[k], means))
+    assert score["position"] < min(0.09, 0.7 * error[k])  # by hand, from ranges alone: 0.11 to 0.21 m
+
+
+def test_a_late_reading_tells_of_where_the_drone_was():
+    theta = indoor.INDOOR_DRONE | {"bias": tuple(0.1 * k for k in range(8)), "late": (0.2, 0.1)}
+    theta |= {"range": tuple(np.log(0.1 * (k + 1)) for k in range(8)), "acceleration": (np.log(2.0), np.log(3.0))}
+    model = indoor.ranging_drone(theta)
+    x = indoor.Moving(jnp.array([1.0, 2.0, 0.5]), jnp.array([0.5, -1.0, 2.0]))
+    anchor = np.array([-3.0, 4.0, 2.0])
+    was = np.array([1.0 - 0.2 * 0.5, 2.0 + 0.2, 0.5 - 0.4])
+    for k in range(8):
+        sensor = model.sensors[f"range_{k + 1}"]
+        assert float(sensor.h(x, anchor)) == pytest.approx(np.linalg.norm(was - anchor) + 0.1 * k, rel=1e-9)
+        assert float(sensor.R(x, anchor)[0, 0]) == pytest.approx((0.1 * (k + 1)) ** 2)
+    assert float(model.sensors["height"].h(x, ())) == pytest.approx(0.5 - 0.1 * 2.0)
+    y = model.f(x, (), 0.5)
+    np.testing.assert_allclose(y.pos, [1.25, 1.5, 1.5])
+    np.testing.assert_allclose(y.vel, x.vel)
+    # Q against its definition: the integral of G(s) density G(s)', G(s) = [s, 1] in each axis, midpoint rule.
+    s = (np.arange(2000) + 0.5) * 0.5 / 2000
+    Q = np.asarray(model.Q(x, (), jnp.asarray(0.5)))
+    expected = np.zeros((6, 6))
+    for axis, density in enumerate((4.0, 4.0, 9.0)):
+        G = np.zeros((2000, 6))
+        G[:, axis], G[:, 3 + axis] = s, 1.0
+        expected += density * G.T @ G * 0.5 / 2000
+    np.testing.assert_allclose(Q, expected, rtol=1e-6, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("name", "sequences"),
     [
@@ -187,7 +249,7 @@ def shuffled(stream: jf.Stream, rng: np.random.Generator) -> jf.Stream:
     return jf.Stream(*(part if part is None else jax.tree.map(lambda a: a[order], part) for part in stream))
 
 
-@pytest.mark.parametrize("name", ["utias_mrclam", "nclt_1hz", "udacity_ctrv"])
+@pytest.mark.parametrize("name", ["utias_mrclam", "nclt_1hz", "udacity_ctrv", "crazyflie_uwb"])
 def test_a_shuffled_recording_gives_the_very_same_log(name):
     data = datasets.load(name)
     rng = np.random.default_rng(1)
@@ -205,7 +267,7 @@ def test_a_shuffled_recording_gives_the_very_same_log(name):
         assert (original.log.dt == 0).sum() > 500
 
 
-@pytest.mark.parametrize("name", ["udacity_ctrv", "utias_mrclam", "nclt_1hz"])
+@pytest.mark.parametrize("name", ["udacity_ctrv", "utias_mrclam", "nclt_1hz", "crazyflie_uwb"])
 def test_no_reading_knows_the_truth(name):
     data = datasets.load(name)
     off = data._replace(truth={k: (t, x + 1.0) for k, (t, x) in data.truth.items()})

@@ -18,6 +18,7 @@ from jaxfilt.datasets import Dataset
 from jaxfilt.log import stack
 from jaxfilt.recordings.bicycle import udacity_ctrv
 from jaxfilt.recordings.campus import nclt_1hz
+from jaxfilt.recordings.indoor import crazyflie_uwb
 from jaxfilt.recordings.wheels import dart_car, utias_mrclam, wifibot
 from jaxfilt.types import Gaussian, Log, PyTree, Replay
 
@@ -27,6 +28,7 @@ _REPLAYS: dict[str, Callable[[Dataset], Replay]] = {
     "nclt_1hz": nclt_1hz,
     "wifibot": wifibot,
     "dart_car": dart_car,
+    "crazyflie_uwb": crazyflie_uwb,
 }
 
 GATES: dict[str, float | None] = {
@@ -35,6 +37,7 @@ GATES: dict[str, float | None] = {
     "nclt_1hz": 0.9,  # GPS off by up to 120 m; of 0.5 to 0.99999 the best on the two calibration runs
     "wifibot": None,
     "dart_car": None,
+    "crazyflie_uwb": 0.999,  # ranges off by metres, up to a tenth of those to anchor 8
 }
 """Recording -> the ``gate`` of the filter that goes with its model's parameters."""
 
@@ -45,7 +48,7 @@ def names() -> tuple[str, ...]:
     Example:
         >>> import jaxfilt.recordings
         >>> jaxfilt.recordings.names()
-        ('udacity_ctrv', 'utias_mrclam', 'nclt_1hz', 'wifibot', 'dart_car')
+        ('udacity_ctrv', 'utias_mrclam', 'nclt_1hz', 'wifibot', 'dart_car', 'crazyflie_uwb')
     """
     return tuple(_REPLAYS)
 

@@ -53,8 +53,9 @@ class Descent(NamedTuple):
 class Way(NamedTuple):
     """Where a descent is: of S starts, from ``origin``, the vectors ``V`` (S, p) with ``loss`` (S,), ``gradient``
     (S, p) and ``lost`` (S,) runs there; the ``memory`` of the optimizer; the ``lowest`` validation losses by run
-    (S, R) so far; the vectors that were kept as ``best``, their score and their step; how long each start has ``waited`` for
-    better ones, and whether it is ``done``; and the history, (steps, S, ...), NaN where it is not written yet."""
+    (S, R) so far; the vectors that were kept as ``best``, their score and their step; how long each start has
+    ``waited`` for better ones, and whether it is ``done``; and the history, (steps, S, ...), NaN where it is not
+    written yet."""
 
     step: np.ndarray
     origin: np.ndarray

@@ -141,9 +141,10 @@ def _nees(values: np.ndarray, dim: int) -> Consistency:
     there = values[np.isfinite(values).any(1)]
     if len(there) < 2:
         return anees_of_one_run(there.ravel(), dim, CONFIDENCE)
-    with np.errstate(over="ignore"):  # of a run that has diverged
+    with np.errstate(over="ignore", invalid="ignore"):  # of a run that has diverged
         means, squares = np.nanmean(there, 1), np.nanmean(there**2, 1)
-    return anees_total(len(there), means.mean(), means.var(ddof=1), squares.mean(), dim, CONFIDENCE)
+        between = means.var(ddof=1)
+    return anees_total(len(there), means.mean(), between, squares.mean(), dim, CONFIDENCE)
 
 
 def _nis(values: np.ndarray, dof: np.ndarray) -> Consistency:
