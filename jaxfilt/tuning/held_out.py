@@ -17,7 +17,7 @@ from jaxfilt.fold import Seen, by_row
 from jaxfilt.metrics import Blocks
 from jaxfilt.scores import Estimate
 from jaxfilt.tuning.loss import Problem, compiled, started
-from jaxfilt.tuning.split import Case, apart
+from jaxfilt.tuning.split import Case, apart, over_runs
 from jaxfilt.types import Array, PyTree
 
 ONE_SIGMA = 0.6827
@@ -75,7 +75,7 @@ def scorer(problem: Problem, case: Case, theta: PyTree) -> Callable[[PyTree], Ro
         return found
 
     def every(theta: PyTree, data: Case) -> dict[str, Array]:
-        return jax.vmap(one, in_axes=(None, axes))(theta, data)
+        return over_runs(lambda case: one(theta, case), data, axes)()
 
     program = compiled(every, theta, data)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxfilt.chunk import CPU_OPTIONS
 from jaxfilt.fold import Objective, View, fold
 from jaxfilt.tuning.parameters import Parameters
-from jaxfilt.tuning.split import Case
+from jaxfilt.tuning.split import Case, over_runs
 from jaxfilt.types import Array, Filter, Gaussian, PyTree, Space
 
 PENALTY = 1e6
@@ -98,8 +98,8 @@ def _evaluated(problem: Problem, v: Array, data: Case, begin: Gaussian | None, a
     # Each run has parameters of its own, all alike: so its share of the gradient comes out apart, and that of a run
     # that diverged, NaN, can be left out. (A sum over runs of which one is NaN is NaN, whatever is selected before.)
     V = jnp.broadcast_to(v, (runs, len(v)))
-    every = jax.vmap(lambda v, case, begin: _sums(problem, v, case, begin), in_axes=(0, axes, 0))
-    sums, pull = jax.vjp(lambda V: every(V, data, begin), V) if gradient else (every(V, data, begin), None)
+    every = over_runs(lambda v, begin, case: _sums(problem, v, case, begin), data, axes)
+    sums, pull = jax.vjp(lambda V: every(V, begin), V) if gradient else (every(V, begin), None)
     sound = jnp.stack([jnp.isfinite(s.reshape(runs, -1)).all(1) for s in sums.values()]).all(0)
     picked = {name: jnp.where(_like(sound, s), s, 0.0) for name, s in sums.items()}
     total = {name: s.sum(0) for name, s in picked.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,10 @@ from jaxfilt.types import Log, Model, Space, Truth
 
 LEAST_RUNS = 5
 """So many runs are split by run, fewer by time."""
+
+
+FEW = 16
+"""Up to so many runs of different schedules are computed one after the other."""
 
 
 class Split(NamedTuple):
@@ -211,6 +215,29 @@ def apart(case: Case) -> tuple[Any, Any]:
     return structure.unflatten(
         [leaf[0] if k is None else leaf for leaf, k in zip(leaves, of_leaves, strict=True)]
     ), axes
+
+
+def over_runs(function: Callable, data: Case, axes: Case) -> Callable:
+    """(own arguments, with a leading run axis) -> ``function(own arguments, case)`` of each run of data taken `apart`.
+
+    At once, under `jax.vmap`; but a few runs of different schedules one after the other: in a batch every row would
+    compute what any of them reads, and then select.
+    """
+    runs = len(data.run)
+    schedule = jax.tree.leaves((axes.log.dt, axes.log.valid))  # None, shared, is no leaf
+    if not schedule or runs > FEW:
+        return lambda *own: jax.vmap(function, in_axes=(*[0] * len(own), axes))(*own, data)
+    leaves, structure = jax.tree.flatten(data)
+    along = structure.flatten_up_to(axes)
+
+    def one(given: tuple) -> Any:
+        own, mine = given
+        rest = iter(mine)
+        case = structure.unflatten([leaf if k is None else next(rest) for leaf, k in zip(leaves, along, strict=True)])
+        return function(*own, case)
+
+    batched = [leaf for leaf, k in zip(leaves, along, strict=True) if k == 0]
+    return lambda *own: jax.lax.map(one, (own, batched))
 
 
 def some(case: Case, axes: Case, runs: np.ndarray) -> Case:
