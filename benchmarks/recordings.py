@@ -30,6 +30,7 @@ NOTES = {
     "nclt_1hz": "RMSE of the position (m) and mean error (m); 2013-04-05 is the test, the others calibrated it",
     "wifibot": "RMSE of the position (m); fixes made from the truth, 2 Hz, 0.1 m",
     "dart_car": "RMSE of the position (m); fixes made from the truth, 2 Hz, 0.05 m",
+    "crazyflie_uwb": "RMSE of the position (m), in space; a newcomer's noises: `benchmarks.tuning` finds better ones",
 }
 
 
