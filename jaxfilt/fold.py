@@ -1,6 +1,6 @@
 """An objective, and its sums over one run: what tuning differentiates.
 
-The sums are taken inside the scan, whose body is checkpointed: reverse mode keeps one belief a row, nothing else.
+What is taken of a row is taken inside the scan, whose body is checkpointed: reverse mode keeps one belief a row.
 """
 
 from __future__ import annotations
@@ -159,18 +159,8 @@ def fold(
         view: the part of the state that the truth knows.
         segment: as in `jaxfilt.scan`.
     """
-    take, belief, rows = _taken(objective, filter, belief, log, truth, space, view)
-
-    def body(carry: tuple, xs: tuple) -> tuple[tuple, None]:
-        b, sums = carry
-        row, counts = xs
-        b, more = take(b, row)
-        return (b, {name: sums[name] + jnp.where(counts, more[name], 0.0) for name in sums}), None
-
-    shapes = jax.eval_shape(lambda b, row: take(b, row)[1], belief, jax.tree.map(lambda a: a[0], rows))
-    sums = {name: jnp.zeros(shape.shape, shape.dtype) for name, shape in shapes.items()}
-    (_, sums), _ = checkpointed(body, (belief, sums), (rows, weight), segment)
-    return sums
+    each = by_row(objective, filter, belief, log, truth, space, view, segment)
+    return {name: jnp.where(weight.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0).sum(0) for name, a in each.items()}
 
 
 def by_row(
@@ -181,10 +171,11 @@ def by_row(
     truth: Truth | None,
     space: Space,
     view: View = itself,
+    segment: int | None = None,
 ) -> dict[str, jax.Array]:
     """What the objective takes of each row, leading axis T: the terms of `fold`."""
     take, belief, rows = _taken(objective, filter, belief, log, truth, space, view)
-    return checkpointed(take, belief, rows)[1]
+    return checkpointed(take, belief, rows, segment)[1]
 
 
 def _taken(

@@ -169,11 +169,11 @@ def tune(
     definite("theta", matrices(problem, theta, case))
 
     train = restricted(case, own[TRAIN])
-    # What is compiled for later, while the first descent is under way.
+    # What is needed later is compiled beside what is under way.
     with ThreadPoolExecutor(1) as beside:
-        scoring = beside.submit(scorer, problem, case, theta)
         validating = beside.submit(_validator, problem, case, own.get(VALIDATION), starts)
         batches = Batches(problem, train, starts, batch, length, seed(key))
+        scoring = beside.submit(scorer, problem, case, theta)
         v = free.start.astype(dtype)
         _influential(batches, v, starts, problem, train)
         compiled = time.perf_counter()

@@ -72,7 +72,8 @@ def hessian_and_slopes(
         ahead, behind = at.copy(), at.copy()
         ahead[j], behind[j] = at[j] + h, at[j] - h
         moved = float(ahead[j]) - float(behind[j])  # in float32 not quite 2 h
-        return jax.tree.map(lambda a, b: (_float64(a) - _float64(b)) / moved, evaluate(ahead), evaluate(behind))
+        with np.errstate(invalid="ignore"):  # sums of a run that has diverged
+            return jax.tree.map(lambda a, b: (_float64(a) - _float64(b)) / moved, evaluate(ahead), evaluate(behind))
 
     columns = [column(j, h) for j in range(len(at))]
     for j, (own, _) in enumerate(columns):
