@@ -14,8 +14,8 @@ from jaxfilt.arguments import Mistake, explained
 from jaxfilt.command import built, finish, kept, typed, typer
 from jaxfilt.fit import Fit
 from jaxfilt.study import Interrupted
-from jaxfilt.tune import Uninfluential
 from jaxfilt.tune import tune as tuned
+from jaxfilt.tuning.setup import Uninfluential
 from jaxfilt.tuning_data import Job
 
 

@@ -17,7 +17,7 @@ from test_cli import _settings, invoke, is_picture, mistake, summary  # noqa: F4
 import jaxfilt as jf
 from jaxfilt import arguments, cli, cli_tune, datasets, files, objectives, recordings, scenarios, terminal, tuning_data
 from jaxfilt.study import Interrupted
-from jaxfilt.tune import Uninfluential
+from jaxfilt.tuning.setup import Uninfluential
 from jaxfilt.tuning.split import Split
 
 OWN = """

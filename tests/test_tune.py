@@ -13,8 +13,8 @@ import pytest
 
 import jaxfilt as jf
 from jaxfilt import priors
-from jaxfilt.tune import Uninfluential
 from jaxfilt.tuning.parameters import parameters
+from jaxfilt.tuning.setup import Uninfluential
 
 TRUE = {"q": jnp.log(jnp.array([0.5])), "r": jnp.log(jnp.array([2.0])), "p": jnp.log(jnp.array([1.0]))}
 WRONG = {"q": TRUE["q"] + math.log(10.0), "r": TRUE["r"] - math.log(10.0), "p": TRUE["p"]}

@@ -156,7 +156,6 @@ class Certainty(NamedTuple):
 def certainty(
     problem: Problem,
     batches: Batches,
-    starts: int,
     rows: Callable[[PyTree], Rows],
     seen: Rows,
     case: Case,
@@ -167,7 +166,7 @@ def certainty(
 
     Args:
         problem: that was solved.
-        batches: of all the training data, for so many starts.
+        batches: of all the training data.
         rows: from `jaxfilt.tuning.held_out.scorer`; ``seen`` at v.
         case: all the data.
     """
@@ -176,7 +175,7 @@ def certainty(
     number, observed, what = observations(weight, len(v))
 
     def gradient(at: np.ndarray) -> np.ndarray:
-        V = np.tile(np.asarray(at, v.dtype), (starts, 1))
+        V = np.tile(np.asarray(at, v.dtype), (batches.starts, 1))
         return np.asarray(batches(V, 0, V).gradient[0])
 
     def sums(at: np.ndarray) -> dict[str, np.ndarray]:

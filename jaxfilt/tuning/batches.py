@@ -32,7 +32,7 @@ class Batches:
     ) -> None:
         self._begins = None if length is None else _Begins(problem, case, starts, length)
         case = case if length is None else pieces(case, length)
-        self.runs = len(case.run)
+        self.runs, self.starts = len(case.run), starts
         self.batch = self.runs if batch is None else batch
         if not 1 <= self.batch <= self.runs:
             what = "runs" if length is None else "pieces of runs"
