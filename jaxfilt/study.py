@@ -69,7 +69,7 @@ class Study(NamedTuple):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C; ``result`` is what was found until then: a `Study` (or a `Sweep`) of fewer runs, a `Fit` of fewer steps."""
+    """Ctrl-C; ``result`` is what was found: a `Study` (or a `Sweep`) of fewer runs, a `Fit` of fewer steps."""
 
     def __init__(self, result: Any) -> None:
         super().__init__("interrupted")
