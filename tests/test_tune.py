@@ -3,6 +3,7 @@
 import functools
 import math
 import re
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -232,6 +233,38 @@ def test_pieces_together_are_the_whole_run():
     assert (
         1e-3 < np.abs(cut.gradient - whole.gradient).max() < 0.5 * np.abs(whole.gradient).max()
     )  # what is not carried over
+
+
+def test_a_run_of_nan_leaves_loss_and_gradient_of_the_others():
+    """NaN comes back from it in reverse mode whatever is multiplied by 0; each run has a gradient of its own."""
+    from jaxfilt.tuning import batches, loss, split
+
+    logs, truth = runs()
+    theta = jax.tree.map(jnp.asarray, TRUE)
+    problem = loss.Problem(jf.log_score, kf, (start,), parameters(theta), jf.vector(1), lambda x: x)
+    V = problem.parameters.start[None]
+
+    def evaluated(logs, truth, spoil=None):
+        case, _ = split.gathered(logs, truth, walk(theta), jf.log_score, jf.vector(1), np.float64)
+        if spoil is not None:
+            case.log.z["z"][spoil, 30] = np.nan
+        return batches.Batches(problem, case)(V, 0, V)
+
+    spoilt = evaluated(logs, truth, spoil=2)
+    rest = evaluated(*jax.tree.map(lambda a: np.delete(a, 2, axis=0), (logs, truth)))
+    assert spoilt.sound.sum() == RUNS - 1
+    assert not spoilt.sound[0, 2]
+    np.testing.assert_allclose(spoilt.gradient, rest.gradient, rtol=1e-10)
+    np.testing.assert_allclose(spoilt.loss - loss.PENALTY / RUNS, rest.loss, rtol=1e-6)
+
+
+def test_pieces_begin_where_the_parameters_at_the_start_of_their_epoch_say():
+    from jaxfilt.tuning.descent import _anchor
+
+    way = SimpleNamespace(origin="origin", path=[f"after {k + 1}" for k in range(9)])
+    three = SimpleNamespace(each=3)
+    found = [_anchor(way, three, step, f"at {step}") for step in range(8)]
+    assert found == ["at 0", "origin", "origin", "at 3", "after 3", "after 3", "at 6", "after 6"]
 
 
 def test_a_prior_holds_what_the_data_leave_open():
