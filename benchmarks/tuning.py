@@ -262,9 +262,8 @@ def scored(task: Task, replay: Replay, theta: PyTree) -> Score:
     index = list(replay.blocks["position"][0])
 
     def store(b: Gaussian, info: dict[str, jf.Info]) -> tuple:
-        x = replay.view(b.mean)
-        J = jax.jacfwd(lambda d: part.minus(replay.view(whole.plus(b.mean, d)), x))(jnp.zeros(whole.dim, b.cov.dtype))
-        return x, (J @ b.cov @ J.T)[jnp.ix_(jnp.array(index), jnp.array(index))]
+        x, P = jf.taylor(replay.view, b, whole, part)[:2]
+        return x, P[jnp.ix_(jnp.array(index), jnp.array(index))]
 
     def run(theta: PyTree, log: Log, truth: PyTree) -> tuple:
         filter = jf.ekf(replay.model(theta), gate=task.gate)

@@ -120,11 +120,15 @@ def compiled(plan: Plan, devices: tuple, structure: Any, leaves: tuple) -> Progr
         jitted = jax.jit(lambda *a: _joined(plan, parts(*a)), in_shardings=inward, out_shardings=everywhere)
     lowered = jitted.lower(*structure.unflatten(leaves))
     digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
-    device: Any = devices[0]
-    if device.platform == "cpu":
+    return Program(finished(lowered, devices[0].platform), digest)
+
+
+def finished(lowered: jax.stages.Lowered, platform: str) -> jax.stages.Compiled:
+    """A lowered program, compiled; on a CPU without Eigen's threads."""
+    if platform == "cpu":
         with contextlib.suppress(jax.errors.JaxRuntimeError):  # an XLA that does not know the option
-            return Program(lowered.compile(compiler_options=CPU_OPTIONS), digest)
-    return Program(lowered.compile(), digest)
+            return lowered.compile(compiler_options=CPU_OPTIONS)
+    return lowered.compile()
 
 
 def placed(plan: Plan, devices: tuple, arguments: tuple, first: int = 0) -> tuple:

@@ -15,13 +15,14 @@ import numpy as np
 from jaxfilt import doors
 from jaxfilt import log as logs
 from jaxfilt.run import checkpointed
+from jaxfilt.transforms import taylor
 from jaxfilt.types import Array, Filter, Gaussian, Info, Log, PyTree, Space, Truth
 
 View = Callable[[PyTree], PyTree]
 
 
 def itself(x: PyTree) -> PyTree:
-    """The part of the state that the truth knows, unless told otherwise: all of it."""
+    """What the truth and the filter have in common, unless told otherwise: all of it."""
     return x
 
 
@@ -193,15 +194,10 @@ def _taken(
     seen, held = withheld(log, objective.held)
 
     def compared(b: Gaussian, truth: Truth) -> tuple[jax.Array, jax.Array]:
-        x = view(b.mean)
+        # The belief as the truth sees it; of the whole state there is nothing to differentiate.
+        x, P = b if view is itself else taylor(view, b, whole, space)[:2]
         there = jnp.asarray(truth.mask)
         point = jax.tree.map(lambda a, own: jnp.where(there, jnp.asarray(a, dtype), own), truth.x, x)
-        if view is itself:
-            P = b.cov
-        else:
-            origin = jnp.zeros(whole.dim, dtype)
-            J = jax.jacfwd(lambda d: space.minus(view(whole.plus(b.mean, d)), x))(origin)
-            P = J @ b.cov @ J.T
         return space.minus(point, x), jnp.where(there, P, jnp.eye(space.dim, dtype=dtype))
 
     def take(b: Gaussian, xs: tuple) -> tuple[Gaussian, dict[str, Array]]:

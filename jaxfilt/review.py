@@ -17,6 +17,7 @@ from jaxfilt.metrics import Blocks, Whiteness
 from jaxfilt.run import scan
 from jaxfilt.scores import Fault
 from jaxfilt.task import Filters, checked, checked_blocks, strong
+from jaxfilt.transforms import taylor
 from jaxfilt.types import Gaussian, Info, Log, PyTree, Replay, Space, Status, Truth
 from jaxfilt.verdict import Verdict, innovation_verdict
 
@@ -118,10 +119,7 @@ def _one(replay: Replay, filters: Filters, theta: PyTree, log: Log, known: PyTre
     start, whole, part = replay.belief(theta), replay.model(theta).space, replay.space
 
     def store(b: Gaussian, info: dict[str, Info]) -> tuple:
-        x = replay.view(b.mean)
-        origin = jnp.zeros(whole.dim, b.cov.dtype)
-        G = jax.jacfwd(lambda d: part.minus(replay.view(whole.plus(b.mean, d)), x))(origin)
-        P = G @ b.cov @ G.T
+        x, P = taylor(replay.view, b, whole, part)[:2]
         spread = jnp.diagonal(P) if replay.truth is None else P
         return x, spread, info, jnp.all(jnp.isfinite(b.cov)) & jnp.all(jnp.isfinite(spread))
 

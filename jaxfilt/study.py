@@ -17,11 +17,12 @@ from jaxfilt.campaign import run
 from jaxfilt.chunk import NO_FAULT
 from jaxfilt.consistency import CONFIDENCE
 from jaxfilt.credibility import noncredibility
+from jaxfilt.fold import itself
 from jaxfilt.metrics import Blocks
 from jaxfilt.mismatch import Corruption
 from jaxfilt.scores import Diverged, Fault, Paired, Scores, Worst, paired, scores
 from jaxfilt.tally import Sums, every
-from jaxfilt.task import Filters, Options, Task, itself, seed, task_of
+from jaxfilt.task import Filters, Options, Task, seed, task_of
 from jaxfilt.totals import NOBODY, Records, Totals
 from jaxfilt.types import Array, Gaussian, Log, Model, PyTree, Space, Status
 from jaxfilt.verdict import Verdict, verdicts

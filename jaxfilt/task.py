@@ -15,6 +15,7 @@ from jaxfilt import checkpoint, doors, metrics
 from jaxfilt import log as logs
 from jaxfilt.chunk import Plan
 from jaxfilt.consistency import CONFIDENCE
+from jaxfilt.fold import itself
 from jaxfilt.metrics import Blocks
 from jaxfilt.mismatch import Corruption
 from jaxfilt.scores import STATE
@@ -25,11 +26,6 @@ MEMORY = 64e6
 
 Filters = Mapping[str, Callable[[PyTree], Filter]]
 """name -> (theta -> filter)"""
-
-
-def itself(x: PyTree) -> PyTree:
-    """The part of the truth that the filters estimate, unless told otherwise: all of it."""
-    return x
 
 
 class Options(NamedTuple):

@@ -167,7 +167,7 @@ def tune(
         V = starts_around(v if estimate is None else estimate, v, starts, spread, key)
         kept = None
         if out is not None:
-            kept = Kept(Path(out), resume, about(problem, case, own, V, plan, optimizer, seed(key)))
+            kept = Kept(Path(out), resume, about(problem, case, own, V, optimizer, seed(key)))
         way, why = pursued(plan, V, batches, validating.result(), kept, progress)
         rows = scoring.result()
     ran = time.perf_counter()

@@ -15,9 +15,10 @@ import numpy as np
 from jaxfilt.filters import ekf
 from jaxfilt.noise import const
 from jaxfilt.objectives import likelihood
+from jaxfilt.transforms import taylor
 from jaxfilt.tuning.loss import Problem, started
 from jaxfilt.tuning.split import Case
-from jaxfilt.types import Array, Filter, Model, PyTree, Sensor
+from jaxfilt.types import Array, Filter, Gaussian, Model, PyTree, Sensor
 
 EXACT, LOOSE = 1e-3, 1e-6
 """Standard deviation of the truth, if nobody says: as a share of what the process noise adds in one step, and of what
@@ -68,12 +69,7 @@ def _least_std(problem: Problem, case: Case, theta: PyTree) -> np.ndarray:
     model, belief = problem.filter(theta).model, started(problem, theta, first)
     dt = np.median(case.log.dt[case.log.dt > 0])
     u = jax.tree.map(lambda a: a[0], first.log.u)
-    Q = np.asarray(model.Q(belief.mean, u, jnp.asarray(dt)))
-    mean = problem.view(belief.mean)
-    J = np.asarray(
-        jax.jacfwd(lambda d: problem.space.minus(problem.view(model.space.plus(belief.mean, d)), mean))(
-            jnp.zeros(model.space.dim, belief.cov.dtype)
-        )
-    )
-    added, unknown = (np.sqrt(np.diag(J @ np.asarray(P) @ J.T)) for P in (Q, belief.cov))
+    Q = model.Q(belief.mean, u, jnp.asarray(dt))
+    seen = [taylor(problem.view, Gaussian(belief.mean, P), model.space, problem.space).cov for P in (Q, belief.cov)]
+    added, unknown = (np.sqrt(np.diag(P)) for P in seen)
     return (EXACT * added + LOOSE * unknown).astype(belief.cov.dtype)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxfilt.chunk import CPU_OPTIONS
+from jaxfilt.chunk import finished
 from jaxfilt.fold import Objective, View, fold
 from jaxfilt.tuning.parameters import Parameters
 from jaxfilt.tuning.split import Case, over_runs
@@ -33,13 +32,12 @@ class Problem(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """For each of S parameter vectors: the ``loss`` (S,), its ``gradient`` (S, p), the runs' sums (S, R, ...), their
-    shares of the gradient ``by_run`` (S, R, p), and which runs were ``sound`` (S, R)."""
+    """For each of S parameter vectors: the ``loss`` (S,), its ``gradient`` (S, p), the runs' sums (S, R, ...), and
+    which runs were ``sound`` (S, R)."""
 
     loss: jax.Array
     gradient: jax.Array
     sums: dict[str, jax.Array]
-    by_run: jax.Array
     sound: jax.Array
 
 
@@ -52,7 +50,7 @@ def losses(
     """The program (V (S, p), data, begin) -> `Evaluated`, compiled for data of this shape, taken `apart`.
 
     ``begin``: of pieces of runs, what they go on from: beliefs (S, R, ...). Without ``gradient`` it is cheaper, and
-    gradient and by_run are 0.
+    the gradient is 0.
     """
 
     def evaluated(v: Array, data: Case, begin: Gaussian | None) -> Evaluated:
@@ -66,13 +64,8 @@ def losses(
 
 
 def compiled(function: Callable, *arguments: Any) -> Any:
-    """A function, compiled for arguments of these shapes; on a CPU without Eigen's threads, which cost more than they
-    bring to thousands of small products."""
-    lowered = jax.jit(function).lower(*arguments)
-    if jax.default_backend() == "cpu":
-        with contextlib.suppress(jax.errors.JaxRuntimeError):  # an XLA that does not know the option
-            return lowered.compile(compiler_options=CPU_OPTIONS)
-    return lowered.compile()
+    """A function, compiled for arguments of these shapes."""
+    return finished(jax.jit(function).lower(*arguments), jax.default_backend())
 
 
 def started(problem: Problem, theta: PyTree, case: Case) -> Gaussian:
@@ -105,21 +98,20 @@ def _evaluated(problem: Problem, v: Array, data: Case, begin: Gaussian | None, a
     total = {name: s.sum(0) for name, s in picked.items()}
     loss, slope = jax.value_and_grad(problem.objective.loss)(total)
     loss += PENALTY * (1 - sound.mean(dtype=loss.dtype))
-    by_run = jnp.zeros_like(V)
+    whole = jnp.zeros_like(v)
     if pull is not None:
         cotangent = {
             name: jnp.where(_like(sound, s), jnp.broadcast_to(slope[name], s.shape), 0.0) for name, s in sums.items()
         }
         (by_run,) = pull(cotangent)
         sound &= jnp.isfinite(by_run).all(1)
-        by_run = jnp.where(sound[:, None], by_run, 0.0)
-    whole = by_run.sum(0)
+        whole = jnp.where(sound[:, None], by_run, 0.0).sum(0)
     prior = problem.prior
     if prior is not None:
         log_density, ascent = jax.value_and_grad(lambda v: prior(problem.parameters.tree(v)))(v)
         count = jnp.maximum(total["count"], 1.0)
         loss, whole = loss - log_density / count, whole - ascent / count
-    return Evaluated(loss, whole, picked, by_run, sound)
+    return Evaluated(loss, whole, picked, sound)
 
 
 def _like(flags: Array, array: Array) -> jax.Array:

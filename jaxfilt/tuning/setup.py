@@ -65,6 +65,7 @@ def planned(
     batch: int | None,
     length: int | None,
 ) -> Descent:
+    """How to go down, checked; an optimizer by its name is made."""
     if optimizer == LBFGS:
         for name, given in {"batch": batch, "length": length, "clip": clip}.items():
             if given is not None:
@@ -141,7 +142,7 @@ def starts_around(around: np.ndarray, given: np.ndarray, starts: int, spread: fl
 
 
 def about(
-    problem: Problem, case: Case, own: Mapping[str, np.ndarray], V: np.ndarray, plan: Descent, optimizer: Any, seed: int
+    problem: Problem, case: Case, own: Mapping[str, np.ndarray], V: np.ndarray, optimizer: Any, seed: int
 ) -> dict[str, Any]:
     """What a checkpoint says of the tuning."""
     return {
