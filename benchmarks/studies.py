@@ -64,8 +64,8 @@ def flat(x: Bicycle) -> jax.Array:
     return jnp.concatenate([x.pos, x.yaw[..., None], x.speed[..., None]], axis=-1)
 
 
-def simulator(steps: int) -> Callable[[jax.Array], Runs]:
-    """Function of run numbers (N,) that simulates these runs."""
+def simulator(steps: int, jit: bool = True) -> Callable[[jax.Array], Runs]:
+    """Function of run numbers (N,) that simulates these runs; for use inside a larger program without ``jit``."""
     plan, key = CAR.schedule(steps), jax.random.key(1)
 
     def one(theta: Any, number: jax.Array) -> Runs:
@@ -73,8 +73,11 @@ def simulator(steps: int) -> Callable[[jax.Array], Runs]:
         truth, log = jf.simulate(CAR.model(theta), belief, plan, key_of_run, CAR.control)
         return Runs(flat(truth), jnp.stack(log.u, axis=1), log.z["gnss"], log.z["odometer"])
 
-    batch = jax.jit(jax.vmap(one, in_axes=(None, 0)))
-    return lambda numbers: jax.block_until_ready(batch(theta(), numbers))
+    batch = jax.vmap(one, in_axes=(None, 0))
+    if not jit:
+        return lambda numbers: batch(theta(), numbers)
+    program = jax.jit(batch)
+    return lambda numbers: jax.block_until_ready(program(theta(), numbers))
 
 
 def squares(truth: Any, mean: Any) -> jax.Array:
@@ -83,12 +86,12 @@ def squares(truth: Any, mean: Any) -> jax.Array:
     return jnp.stack([jnp.sum(e[..., :2] ** 2), jnp.sum(jf.wrap(e[..., 2]) ** 2), jnp.sum(e[..., 3] ** 2)])
 
 
-def studied(steps: int, runs: int) -> Timing:
-    """The study: one program for both filters."""
+def studied(steps: int, runs: int, **how: Any) -> Timing:
+    """The study: one program for both filters. ``how``: arguments of `study`."""
     filters = {name: (lambda theta, build=build: build(CAR.model(theta))) for name, build in FILTERS.items()}
     found = study(
         CAR.model, filters, CAR.belief, CAR.schedule(steps), jax.random.key(0),
-        theta=CAR.theta, runs=runs, blocks=CAR.blocks, control=CAR.control,
+        theta=CAR.theta, runs=runs, blocks=CAR.blocks, control=CAR.control, **how,
     )  # fmt: skip
     return Timing(found.compile_seconds, found.run_seconds, runs)
 

@@ -6,7 +6,7 @@ What is taken of a row is taken inside the scan, whose body is checkpointed: rev
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxfilt import doors
 from jaxfilt import log as logs
-from jaxfilt.run import checkpointed
+from jaxfilt.loop import checkpointed
 from jaxfilt.transforms import taylor
 from jaxfilt.types import Array, Filter, Gaussian, Info, Log, PyTree, Space, Truth
 
@@ -175,23 +175,19 @@ def by_row(
     segment: int | None = None,
 ) -> dict[str, jax.Array]:
     """What the objective takes of each row, leading axis T: the terms of `fold`."""
-    take, belief, rows = _taken(objective, filter, belief, log, truth, space, view)
-    return checkpointed(take, belief, rows, segment)[1]
+    belief = jax.tree.map(lambda a: jnp.asarray(a, belief.cov.dtype), belief)
+    take = taken(objective, filter, space, view, belief.cov.dtype)
+    return checkpointed(take, belief, rows_of(objective, log, truth), segment)[1]
 
 
-def _taken(
-    objective: Objective,
-    filter: Filter,
-    belief: Gaussian,
-    log: Log,
-    truth: Truth | None,
-    space: Space,
-    view: View,
-) -> tuple[Callable, Gaussian, tuple]:
-    """(belief, row) -> (belief, what the objective takes of it); the belief to start from; and the rows."""
-    whole, dtype = filter.model.space, belief.cov.dtype
-    belief = jax.tree.map(lambda a: jnp.asarray(a, dtype), belief)
-    seen, held = withheld(log, objective.held)
+def rows_of(objective: Objective, log: Log, truth: Truth | None) -> tuple[Log, Log, Truth | None]:
+    """What an objective looks at, row by row: what the filter reads, what was kept from it, and the truth."""
+    return *withheld(log, objective.held), truth if objective.needs_truth else None
+
+
+def taken(objective: Objective, filter: Filter, space: Space, view: View, dtype: Any) -> Callable:
+    """(belief, one of `rows_of`) -> (belief, what the objective takes of the row)."""
+    whole = filter.model.space
 
     def compared(b: Gaussian, truth: Truth) -> tuple[jax.Array, jax.Array]:
         # The belief as the truth sees it; of the whole state there is nothing to differentiate.
@@ -208,4 +204,4 @@ def _taken(
         found = objective.row(Seen(filter, b, info, error, cov, known, held_row))
         return b, {name: jnp.asarray(value, dtype) for name, value in found.items()}
 
-    return take, belief, (seen, held, truth if objective.needs_truth else None)
+    return take

@@ -80,8 +80,9 @@ def _written_out(A: jax.Array, slack: float | None) -> jax.Array:
     L = [[nought] * n for _ in range(n)]
     for j in range(n):
         root, zero = _pivot(A[j, j] - sum((L[j][k] * L[j][k] for k in range(j)), nought), A[j, j], slack)
+        inverse = 1 / root  # one division, not one for each row
         for i in range(j, n):
-            element = root if i == j else (A[i, j] - sum((L[i][k] * L[j][k] for k in range(j)), nought)) / root
+            element = root if i == j else (A[i, j] - sum((L[i][k] * L[j][k] for k in range(j)), nought)) * inverse
             L[i][j] = element if zero is False else jnp.where(zero, 0.0, element)
     return jnp.stack([jnp.stack(row) for row in L])
 
@@ -106,7 +107,7 @@ def forward_solve(L: jax.Array, b: jax.Array) -> jax.Array:
         return jax.scipy.linalg.solve_triangular(L, b, lower=True)
     y: list[jax.Array] = []
     for i in range(n):
-        y.append((b[i] - sum((L[i, k] * y[k] for k in range(i)), jnp.zeros_like(b[i]))) / L[i, i])
+        y.append((b[i] - sum((L[i, k] * y[k] for k in range(i)), jnp.zeros_like(b[i]))) * (1 / L[i, i]))
     return jnp.stack(y)
 
 
@@ -117,7 +118,8 @@ def backward_solve(L: jax.Array, b: jax.Array) -> jax.Array:
         return jax.scipy.linalg.solve_triangular(L, b, lower=True, trans=1)
     y: list[jax.Array] = []
     for i in reversed(range(n)):
-        y.insert(0, (b[i] - sum((L[k, i] * y[k - i - 1] for k in range(i + 1, n)), jnp.zeros_like(b[i]))) / L[i, i])
+        rest = b[i] - sum((L[k, i] * y[k - i - 1] for k in range(i + 1, n)), jnp.zeros_like(b[i]))
+        y.insert(0, rest * (1 / L[i, i]))
     return jnp.stack(y)
 
 
@@ -173,5 +175,8 @@ def log_determinant(L: jax.Array) -> jax.Array:
 
 
 def symmetrize(P: jax.Array) -> jax.Array:
-    """(P + P') / 2: a product A P A' is symmetric only to rounding."""
-    return 0.5 * (P + P.T)
+    """The symmetric matrix with the lower triangle of P: a product A P A' is symmetric only to rounding.
+
+    Not (P + P') / 2, for which compiled lanes would have to compute both triangles.
+    """
+    return jnp.tril(P) + jnp.tril(P, -1).T

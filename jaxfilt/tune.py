@@ -17,6 +17,7 @@ import optax
 from jaxfilt import doors
 from jaxfilt.fit import BEFORE, ESTIMATED, TRAIN, TRUE, TUNED, VALIDATION, Fit, History, Parameter
 from jaxfilt.fold import Objective, View, itself
+from jaxfilt.loop import Backend
 from jaxfilt.metrics import Blocks
 from jaxfilt.objectives import likelihood, log_score
 from jaxfilt.study import Interrupted
@@ -62,6 +63,7 @@ def tune(
     truth_std: Sequence[float] | Array | None = None,
     truth_theta: PyTree = None,
     segment: int | None = None,
+    backend: Backend = "auto",
     out: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
@@ -103,6 +105,7 @@ def tune(
         truth_std: (d,) standard deviations of the truth itself, for the noise estimate; default: all but exact.
         truth_theta: the true parameters, of a simulation, to be compared with.
         segment: rows between beliefs that reverse mode keeps, see `jaxfilt.scan`: less memory, more time.
+        backend: what computes the loss and its gradient, see `jaxfilt.scan_runs`.
         out: folder to keep the state in, after each step.
         resume: go on with what is in ``out``, to as many steps as asked for now.
         progress: called with (steps done, steps, loss, validation loss).
@@ -149,7 +152,7 @@ def tune(
             raise ValueError(f"{name}: expected at least 1, got {value}")
     own, words = weights(case, lengths, split, burn_in)
     free = parameters(theta, frozen)
-    problem = Problem(objective, filter, beliefs, free, space, view, prior, segment)
+    problem = Problem(objective, filter, beliefs, free, space, view, prior, segment, backend)
     plan = planned(optimizer, steps, learning_rate, patience, clip, free.names, batch, length)
     key = jax.random.key(0) if key is None else key
     definite("theta", matrices(problem, theta, case))

@@ -1,10 +1,14 @@
 """JAX at its strictest: no silent rank or dtype promotion; float64 there to ask for."""
 
 import os
+import sys
 from pathlib import Path
 
 import jax
 import pytest
+
+# The benchmarks are not installed; behind whatever is.
+sys.path.append(str(Path(__file__).resolve().parent.parent))
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

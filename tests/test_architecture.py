@@ -11,13 +11,14 @@ import jaxfilt
 
 ROOT = Path(jaxfilt.__file__).parent
 FLOORS = [
-    {"types", "elementary", "linalg", "chisquare", "plaintext"},
-    {"doors", "spaces", "consistency", "checkpoint"},
+    {"types", "elementary", "linalg", "chisquare", "plaintext", "lanes"},
+    {"doors", "spaces", "consistency", "checkpoint", "devices", "loop"},
     {"noise", "log", "files", "theta_file", "integrate", "transforms", "bootstrap", "credibility", "priors"},
     {"models", "datasets", "filters"},
     {"run", "simulate", "metrics", "diagnose", "check", "mismatch"},
     {"scenarios", "recordings", "bound", "tally", "findings", "fold"},
-    {"scores", "chunk", "objectives"},
+    {"scores", "streaming", "objectives"},
+    {"chunk"},
     {"verdict", "totals", "task", "fit"},
     {"campaign", "review", "tuning"},
     {"study"},

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxfilt as jf
-from jaxfilt.run import checkpointed
+from jaxfilt.loop import checkpointed
 
 STEPS = 5
 DT = 0.5

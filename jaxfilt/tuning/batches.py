@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfilt.run import checkpointed
+from jaxfilt.loop import checkpointed
 from jaxfilt.tuning.loss import Evaluated, Problem, compiled, losses, started
 from jaxfilt.tuning.split import Case, apart, pieces, some
 from jaxfilt.types import Array, Gaussian, Log

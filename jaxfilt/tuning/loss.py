@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxfilt.chunk import finished
-from jaxfilt.fold import Objective, View, fold
+from jaxfilt.devices import finished
+from jaxfilt.fold import Objective, View, fold, rows_of, taken
+from jaxfilt.loop import Backend, in_lanes, loop
 from jaxfilt.tuning.parameters import Parameters
 from jaxfilt.tuning.split import Case, over_runs
 from jaxfilt.types import Array, Filter, Gaussian, PyTree, Space
@@ -29,6 +30,7 @@ class Problem(NamedTuple):
     view: View
     prior: Callable[[PyTree], Array] | None = None
     segment: int | None = None
+    backend: Backend = "auto"
 
 
 class Evaluated(NamedTuple):
@@ -53,14 +55,16 @@ def losses(
     the gradient is 0.
     """
 
-    def evaluated(v: Array, data: Case, begin: Gaussian | None) -> Evaluated:
-        return _evaluated(problem, v, data, begin, axes, gradient)
+    def every(lanes: bool) -> Callable:
+        def evaluated(v: Array, data: Case, begin: Gaussian | None) -> Evaluated:
+            return _evaluated(problem, v, data, begin, axes, gradient, lanes)
 
-    def every(V: Array, data: Case, begin: Gaussian | None) -> Evaluated:
-        return jax.vmap(evaluated, in_axes=(0, None, 0))(V, data, begin)
+        return lambda V, data, begin: jax.vmap(evaluated, in_axes=(0, None, 0))(V, data, begin)
 
     V = jax.ShapeDtypeStruct((starts, len(problem.parameters.start)), data.log.dt.dtype)
-    return compiled(every, V, data, begin)
+    return in_lanes(
+        lambda lanes: compiled(every(lanes), V, data, begin), problem.backend, len(data.run) * data.weight.shape[-1]
+    )
 
 
 def compiled(function: Callable, *arguments: Any) -> Any:
@@ -75,23 +79,60 @@ def started(problem: Problem, theta: PyTree, case: Case) -> Gaussian:
     return jax.tree.map(lambda *a: jnp.stack(a)[case.run], *each) if len(each) > 1 else each[0]
 
 
+def _begun(problem: Problem, v: Array, case: Case, begin: Gaussian | None) -> Gaussian:
+    """The belief in which one run starts, or a piece of one goes on."""
+    start = started(problem, problem.parameters.tree(v), case)
+    if begin is None or case.first is None:
+        return start
+    first = jnp.asarray(case.first)
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), start, begin)
+
+
 def _sums(problem: Problem, v: Array, case: Case, begin: Gaussian | None) -> dict[str, jax.Array]:
     """Those of one run, or of a piece of one."""
-    theta = problem.parameters.tree(v)
-    start, filter = started(problem, theta, case), problem.filter(theta)
-    if begin is not None and case.first is not None:
-        first = jnp.asarray(case.first)
-        start = jax.tree.map(lambda a, b: jnp.where(first, a, b), start, begin)
+    start, filter = _begun(problem, v, case, begin), problem.filter(problem.parameters.tree(v))
     truth, weight = case.truth, case.weight
     return fold(problem.objective, filter, start, case.log, truth, weight, problem.space, problem.view, problem.segment)
 
 
-def _evaluated(problem: Problem, v: Array, data: Case, begin: Gaussian | None, axes: Case, gradient: bool) -> Evaluated:
+def _every(problem: Problem, data: Case, axes: Case, lanes: bool) -> Callable:
+    """(parameters (R, p), beliefs to go on from) -> the sums of all runs."""
+    if not lanes:
+        return over_runs(lambda v, begin, case: _sums(problem, v, case, begin), data, axes)
+    objective, dtype = problem.objective, data.log.dt.dtype
+
+    def take(v: Array, belief: Gaussian, row: tuple) -> tuple[Gaussian, dict[str, Array]]:
+        filter = problem.filter(problem.parameters.tree(v))
+        return taken(objective, filter, problem.space, problem.view, dtype)(belief, row)
+
+    def body(v: Array, carry: tuple, row: tuple) -> tuple:
+        (belief, sums), (seen, counts) = carry, row
+        belief, found = take(v, belief, seen)
+        return (belief, {name: sums[name] + jnp.where(counts, a, 0.0) for name, a in found.items()}), ()
+
+    def every(V: Array, begin: Gaussian | None) -> dict[str, jax.Array]:
+        beliefs = jax.vmap(lambda v, begin, case: _begun(problem, v, case, begin), (0, 0, axes))(V, begin, data)
+        if objective.held:
+            split = jax.vmap(lambda case: (rows_of(objective, case.log, case.truth), case.weight), (axes,))
+            rows, along = split(data), 0
+        else:
+            rows, along = ((rows_of(objective, c.log, c.truth), c.weight) for c in (data, axes))
+        first = jax.vmap(lambda v, b, rows: take(v, b, jax.tree.map(lambda a: a[0], rows[0]))[1], (0, 0, along))
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(first, V, beliefs, rows))
+        carry, _ = loop(body, V, (beliefs, nothing), rows, runs=len(V), axes=(0, 0, along), outputs=(), backend="lanes")
+        return carry[1]
+
+    return every
+
+
+def _evaluated(
+    problem: Problem, v: Array, data: Case, begin: Gaussian | None, axes: Case, gradient: bool, lanes: bool
+) -> Evaluated:
     runs = len(data.run)
     # Each run has parameters of its own, all alike: so its share of the gradient comes out apart, and that of a run
     # that diverged, NaN, can be left out. (A sum over runs of which one is NaN is NaN, whatever is selected before.)
     V = jnp.broadcast_to(v, (runs, len(v)))
-    every = over_runs(lambda v, begin, case: _sums(problem, v, case, begin), data, axes)
+    every = _every(problem, data, axes, lanes)
     sums, pull = jax.vjp(lambda V: every(V, begin), V) if gradient else (every(V, begin), None)
     sound = jnp.stack([jnp.isfinite(s.reshape(runs, -1)).all(1) for s in sums.values()]).all(0)
     picked = {name: jnp.where(_like(sound, s), s, 0.0) for name, s in sums.items()}
