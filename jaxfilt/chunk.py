@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 from collections.abc import Callable
@@ -11,25 +10,26 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import PartitionSpec
 
-from jaxfilt import metrics
+from jaxfilt import devices as spreading
+from jaxfilt.loop import Added, Backend, Kept, loop
 from jaxfilt.mismatch import Corruption
-from jaxfilt.simulate import simulate
+from jaxfilt.simulate import simulated, started
+from jaxfilt.streaming import NO_FAULT, Row, Told, instants, judged, nothing
 from jaxfilt.tally import (
     NEES_EDGES,
     Blocks,
+    Columns,
     Moments,
     Sums,
     columns,
     error_histogram,
     every,
     histogram,
-    lagged,
     moments,
-    score,
 )
-from jaxfilt.types import Array, Filter, Gaussian, Log, Model, PyTree, Status
+from jaxfilt.types import Array, Filter, Gaussian, Log, Model, PyTree
 
 
 class Plan(NamedTuple):
@@ -52,6 +52,7 @@ class Plan(NamedTuple):
     lags: int
     swept: tuple[bool, bool]
     generator: str
+    backend: Backend
 
 
 class Examples(NamedTuple):
@@ -95,13 +96,6 @@ class Program(NamedTuple):
     digest: str
 
 
-NO_FAULT = np.int32(2**31 - 1)
-"""A fault that is none, later than all others."""
-
-# What runs under vmap are thousands of small products; Eigen's thread pool costs more than it brings.
-CPU_OPTIONS: dict[str, Any] = {"xla_cpu_multi_thread_eigen": False}
-
-
 @functools.lru_cache(maxsize=32)
 def compiled(plan: Plan, devices: tuple, structure: Any, leaves: tuple) -> Program:
     """The program for arguments of these shapes: kept, so that other values compile nothing.
@@ -112,58 +106,22 @@ def compiled(plan: Plan, devices: tuple, structure: Any, leaves: tuple) -> Progr
     if len(devices) == 1:
         jitted = jax.jit(local)
     else:
-        mesh, specs = _mesh(devices), _specs(plan)
-        lead = functools.partial(jax.tree.map, lambda a: a[None])
-        parts = shard_map(lambda *a: lead(local(*a)), mesh, specs, PartitionSpec("runs"))
-        inward = tuple(NamedSharding(mesh, spec) for spec in specs)
-        everywhere = NamedSharding(mesh, PartitionSpec())
-        jitted = jax.jit(lambda *a: _joined(plan, parts(*a)), in_shardings=inward, out_shardings=everywhere)
+        jitted = spreading.spread(local, functools.partial(_joined, plan), devices, _specs(plan))
     lowered = jitted.lower(*structure.unflatten(leaves))
     digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
-    return Program(finished(lowered, devices[0].platform), digest)
-
-
-def finished(lowered: jax.stages.Lowered, platform: str) -> jax.stages.Compiled:
-    """A lowered program, compiled; on a CPU without Eigen's threads."""
-    if platform == "cpu":
-        with contextlib.suppress(jax.errors.JaxRuntimeError):  # an XLA that does not know the option
-            return lowered.compile(compiler_options=CPU_OPTIONS)
-    return lowered.compile()
+    return Program(spreading.finished(lowered, devices[0].platform), digest)
 
 
 def placed(plan: Plan, devices: tuple, arguments: tuple, first: int = 0) -> tuple:
-    """Arguments of a program, from number ``first`` on, as arrays that lie on its devices, also of other processes.
-
-    One device takes them as they are.
-    """
-    if len(devices) == 1:
-        return arguments
-    mesh = _mesh(devices)
-
-    def place(spec: PartitionSpec) -> Callable[[Array], jax.Array]:
-        sharding = NamedSharding(mesh, spec)
-        return lambda a: jax.make_array_from_callback(np.shape(a), sharding, lambda at: np.asarray(a)[at])
-
-    return tuple(jax.tree.map(place(spec), a) for spec, a in zip(_specs(plan)[first:], arguments, strict=False))
-
-
-def _mesh(devices: tuple) -> Mesh:
-    return Mesh(np.array(devices), ("runs",))
+    """Arguments of a program, from number ``first`` on, as arrays that lie on its devices."""
+    return spreading.placed(devices, _specs(plan)[first : first + len(arguments)], arguments)
 
 
 def _specs(plan: Plan) -> tuple[PartitionSpec, ...]:
     """How each argument lies on the devices: what belongs to runs is split, the rest is everywhere."""
-    weights = PartitionSpec(None, "runs") if any(plan.swept) else PartitionSpec("runs")
-    return (PartitionSpec(),) * 4 + (PartitionSpec("runs"), weights)
-
-
-def shard_map(f: Callable, mesh: Mesh, in_specs: Any, out_specs: Any) -> Callable:
-    """`jax.shard_map`, by the name and the options that it has in this JAX."""
-    if hasattr(jax, "shard_map"):
-        return jax.shard_map(f, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
-    from jax.experimental.shard_map import shard_map as early
-
-    return early(f, mesh, in_specs=in_specs, out_specs=out_specs, check_rep=False)
+    runs = spreading.SPREAD
+    weights = PartitionSpec(None, runs) if any(plan.swept) else PartitionSpec(runs)
+    return (PartitionSpec(),) * 4 + (PartitionSpec(runs), weights)
 
 
 def _joined(plan: Plan, parts: Chunk) -> Chunk:
@@ -198,95 +156,118 @@ def _settings(
     return one(theta, truth_theta, log, key, numbers, weights)
 
 
-class _Carried(NamedTuple):
-    """What one run carries from row to row, beside the beliefs."""
-
-    row: Array
-    total: Array
-    count: Array
-    sound: Array
-    fault: Array
-    status: Array
-    worst: Array
-
-
 def _chunk(
     plan: Plan, theta: PyTree, truth_theta: PyTree, log: Log, key: Array, numbers: Array, weights: Array
 ) -> Chunk:
-    """Simulate, filter and score the runs of these numbers; in the sums are those with weights (R, F) True.
-
-    Sums over runs are taken within each row, while its numbers are at hand. What runs share (schedule, inputs, a linear
-    model's covariances) JAX computes once.
-    """
+    """Simulate, filter and score the runs of these numbers; in the sums are those with weights (R, F) True."""
     robot, origin, start = plan.model(truth_theta), plan.origin(truth_theta), plan.belief(theta)
     bank = {name: make(theta) for name, make in plan.filters}
-    space, dtype = next(iter(bank.values())).model.space, origin.cov.dtype
-    corrupt = None if plan.corrupt is None else plan.corrupt(truth_theta)
-    sensors = [name for name in robot.sensors if name in log.z]
-    place = columns(space.dim, len(plan.blocks), sorted(sensors))  # as JAX sorts a dict's keys
+    own_model, dtype = next(iter(bank.values())).model, origin.cov.dtype
+    space = own_model.space
+    log, origin, start = jax.tree.map(jnp.asarray, (log, origin, start))
+    origin, start = (jax.tree.map(lambda a: a.astype(dtype), belief) for belief in (origin, start))
+    sensors = {name: own_model.sensors[name].space.dim for name in robot.sensors if name in log.z}
+    place = columns(space.dim, len(plan.blocks), list(sensors))
+    own = jax.vmap(lambda number: jax.random.fold_in(_key(plan, key), number))(numbers)
+    draw, x, rows, axes = _drawn(plan, robot, origin, truth_theta, log, own)
 
-    def shown(tree: PyTree) -> PyTree:
-        return jax.tree.map(lambda a: jax.lax.all_gather(a, "runs")[: plan.examples], tree)
+    def body(weight: Array, carry: tuple, row: tuple) -> tuple:
+        x, held = carry
+        # A fence: XLA would draw the noises anew for each of the many numbers that a reading goes into.
+        x, read = jax.lax.optimization_barrier(draw(x, row[0]))
+        truth = plan.view(x)
+        held, found = judged(bank, place, plan.blocks, list(sensors), weight, held, read, truth, row[1])
+        return (x, held), (found[:2], found[2:], Examples(truth, held[0]))
 
-    def one(number: Array, weight: Array) -> tuple:
-        own = jax.random.fold_in(jax.random.wrap_key_data(key, impl=plan.generator), number)
-        truth, readings = simulate(robot, origin, log, own, plan.control)
-        if corrupt is not None:
-            # Not fold_in(own, 1): that is the second key of split(own), with which the simulation draws its noises.
-            readings = corrupt(truth, readings, jax.random.fold_in(own, 2))
-        truth = jax.vmap(plan.view)(truth)
+    beliefs, told = dict.fromkeys(bank, start), nothing(place, len(bank), plan.lags, sensors, np.dtype(dtype))
+    (_, (_, told)), (added, some, examples) = loop(
+        body,
+        weights,
+        (x, (beliefs, told)),
+        (rows, instants(log)),
+        runs=len(numbers),
+        axes=(0, (0, None), (axes, None)),
+        outputs=(Added(), Kept(every(len(log.dt))), Kept(runs=plan.examples)),
+        backend=plan.backend,
+    )
+    return _summed(plan, place, space.dim, weights, told, Row(*added, *some), examples)
 
-        def body(carry: tuple, row: tuple[Log, PyTree]) -> tuple:
-            beliefs, told = carry
-            stepped = {name: filt.step(beliefs[name], row[0]) for name, filt in bank.items()}
-            beliefs = {name: b for name, (b, _) in stepped.items()}
-            error = jnp.stack([metrics.errors(space, row[1], b.mean) for b in beliefs.values()])
-            cov = jnp.stack([b.cov for b in beliefs.values()])
-            infos = [{name: info[name] for name in sensors} for _, info in stepped.values()]
-            info = jax.tree.map(lambda *a: jnp.stack(a), *infos)
-            # One call for all filters: each factorization written out costs time to compile.
-            values, white = jax.vmap(functools.partial(score, plan.blocks))(error, cov, info)
-            there = jnp.isfinite(values) & weight[:, None]
-            sums = jax.lax.psum(moments(values[None], there[None], 0), "runs")
-            codes = jnp.stack([info[name].status for name in sensors], 1)
-            sound = jnp.isfinite(error).all(1) & jnp.isfinite(cov).all((1, 2))
-            told = _told(told, values, there, sound, codes, values[:, place["square"]])
-            keep = {name: values[:, place[name]] for name in ("error", "normalised", "nees")}
-            return (beliefs, told), (sums, keep, white, shown(beliefs))
 
-        F, K = len(bank), max(at.stop for at in place.values())
-        number_of = lambda *shape: jnp.zeros((F, *shape), dtype)  # noqa: E731
-        none = jnp.full(F, NO_FAULT)
-        told = _Carried(
-            jnp.int32(0), number_of(K), number_of(K), jnp.full(F, True), none, none, number_of(len(plan.blocks))
-        )
-        beliefs = dict.fromkeys(bank, jax.tree.map(lambda a: jnp.asarray(a, dtype), start))
-        (_, told), (sums, keep, white, tracks) = jax.lax.scan(body, (beliefs, told), (readings, truth))
-        swap = functools.partial(jax.tree.map, lambda a: jnp.swapaxes(a, 0, 1))
-        return sums, Examples(shown(truth), swap(tracks)), told, (keep, white)
+def _key(plan: Plan, data: Array) -> Array:
+    return jax.random.wrap_key_data(data, impl=plan.generator)
 
-    # Time before runs: a scan stores its rows that way, and turning them round would copy all of them.
-    out_axes = (None, None, 0, 1)
-    rows, examples, told, (keep, white) = jax.vmap(one, axis_name="runs", out_axes=out_axes)(numbers, weights)
-    lost = (keep["nees"][-1, :, :, 0] > plan.limit) | ~told.sound | (told.fault != NO_FAULT)
-    each = Each(lost, told.fault, told.status, told.worst)
-    error, nees = (jnp.moveaxis(keep[name], 2, 0) for name in ("error", "nees"))
-    averages = jnp.moveaxis(told.total / told.count, 1, 0)
+
+def _drawn(
+    plan: Plan, robot: Model, origin: Gaussian, truth_theta: PyTree, log: Log, own: Array
+) -> tuple[Callable[[PyTree, tuple], tuple[PyTree, Log]], PyTree, tuple, tuple]:
+    """Where truth and readings come from, for runs with their ``own`` keys (R,): a function of (true state, row) that
+    returns the next state and the row as it was read; the state before the first row; the rows, and their axes.
+
+    They are drawn as they are needed, unless something happens to the readings: that may look at the whole run.
+    """
+    x, keys = jax.vmap(lambda key: started(robot.space, origin, key, len(log.dt)))(own)
+    keys = jax.random.key_data(keys)
+
+    def draw(x: PyTree, row: tuple[Log, Array]) -> tuple[PyTree, Log]:
+        return simulated(robot, x, row[0], _key(plan, row[1]), plan.control)
+
+    if plan.corrupt is None:
+        return draw, x, (log, keys), (None, 0)
+
+    def body(_: tuple, x: PyTree, row: tuple[Log, Array]) -> tuple:
+        x, read = draw(x, row)
+        return x, ((x, read.z, read.u if plan.control else ()),)
+
+    _, ((truth, z, u),) = loop(
+        body,
+        (),
+        x,
+        (log, keys),
+        runs=len(own),
+        axes=(None, 0, (None, 0)),
+        outputs=(Kept(),),
+        backend=plan.backend,
+    )
+    corrupt, shared = plan.corrupt(truth_theta), jax.tree.leaves(log)
+    alike: list[Array | None] = []
+    structures = []
+
+    def spoil(truth: PyTree, z: PyTree, u: PyTree, key: Array) -> list[Array | None]:
+        # Not fold_in(own, 1): that is the second key of split(own), with which the simulation draws its noises.
+        read = log._replace(z=z, u=u if plan.control else log.u)
+        leaves, structure = jax.tree.flatten(corrupt(truth, read, jax.random.fold_in(key, 2)))
+        structures.append(structure)
+        alike.extend(next((a for a in shared if a is leaf), None) for leaf in leaves)
+        return [leaf if same is None else None for leaf, same in zip(leaves, alike, strict=True)]
+
+    spoilt = jax.vmap(spoil)(truth, z, u, own)
+    rows = structures[0].unflatten([b if a is None else a for a, b in zip(alike, spoilt, strict=True)])
+    axes = structures[0].unflatten([0 if a is None else None for a in alike])
+    return lambda x, row: (row[1], row[0]), x, (rows, truth), (axes, 0)
+
+
+def _summed(plan: Plan, place: Columns, dim: int, weights: Array, told: Told, row: Row, examples: Examples) -> Chunk:
+    """The chunk, from what its runs end with (R, ...), sums over them at each row (T, ...), and some rows of each."""
+    lost = (told.nees > plan.limit) | ~told.sound | (told.fault != NO_FAULT)
+    number, first, second = (jnp.swapaxes(a, 0, 1) for a in row.sums)
+    counted, squared = place.named(place.counted, number), place.named(place.squared, second)
+    summed = place.named(place.summed, first)
+    averages = place.named(place.averaged, jnp.moveaxis(told.total / told.count, 1, 0))
     by_filter = jnp.moveaxis(weights, 1, 0)
-    lag = {name: _lagged(jnp.where(weights[..., None], w, 0.0), log, name, plan.lags) for name, w in white.items()}
     sums = Sums(
         runs=by_filter.sum(1),
-        rows=jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), rows),
-        averages=moments(averages, jnp.isfinite(averages), 1),
-        outer=_outer(jnp.where(by_filter[:, None, :, None], error, 0.0)),
-        errors=jax.vmap(error_histogram, in_axes=(2, 1))(keep["normalised"], weights),
-        run_nees=_spread(averages[..., place["nees"].start] / space.dim, by_filter),
-        dots={name: dots for name, (dots, _) in lag.items()},
-        pairs={name: pairs for name, (_, pairs) in lag.items()},
-        paired=_paired(jnp.concatenate([averages[..., place["square"]], averages[..., place["log_score"]]], -1)),
+        rows={name: Moments(counted.get(name), a, squared.get(name)) for name, a in summed.items()},
+        averages={name: moments(a, jnp.isfinite(a), 1) for name, a in averages.items()},
+        outer=_outer(jnp.swapaxes(row.outer, 0, 1), dim),
+        errors=jax.vmap(error_histogram, in_axes=(2, 1))(row.normalised, weights),
+        run_nees=_spread(averages["nees"][..., 0] / dim, by_filter),
+        dots={name: lags.dots.sum(0) for name, lags in told.lags.items()},
+        pairs={name: lags.pairs.sum(0) for name, lags in told.lags.items()},
+        paired=_paired(jnp.concatenate([averages["square"], averages["log_score"]], -1)),
     )
-    some = slice(every(len(log.dt)) - 1, None, every(len(log.dt)))
-    return Chunk(sums, each, error[:, some, : plan.sample], nees[:, some, : plan.sample, 0], examples)
+    each = Each(lost, told.fault, told.status, told.worst)
+    error, nees = (jnp.moveaxis(a[: plan.sample], (0, 2), (2, 0)) for a in (row.error, row.nees))
+    return Chunk(sums, each, error, nees, examples)
 
 
 def _paired(averages: Array) -> Moments:
@@ -301,32 +282,8 @@ def _spread(nees: Array, by_filter: Array) -> jax.Array:
     return jax.vmap(histogram, in_axes=(0, 0, None))(nees, by_filter, NEES_EDGES)
 
 
-def _told(told: _Carried, values: Array, there: Array, sound: Array, codes: Array, square: Array) -> _Carried:
-    """What the run is known to be after one more row: ``values`` (F, K), ``codes`` (F, sensors) of `Status`."""
-    faulty = codes >= Status.BAD_BELIEF
-    new = faulty.any(1) & (told.fault == NO_FAULT)
-    sensor = faulty.argmax(1).astype(jnp.int32)
-    return _Carried(
-        row=told.row + 1,
-        total=told.total + jnp.where(there, values, 0.0),
-        count=told.count + there.astype(told.count.dtype),
-        sound=told.sound & sound,
-        fault=jnp.where(new, told.row * codes.shape[1] + sensor, told.fault),
-        status=jnp.where(new, jnp.take_along_axis(codes, sensor[:, None], 1)[:, 0], told.status),
-        worst=jnp.fmax(told.worst, square),
-    )
-
-
-def _outer(error: Array) -> jax.Array:
-    """Sums over runs (F, T, n, n) of ``e e'`` for errors (F, T, R, n); of what is not finite, nothing."""
-    error = jnp.where(jnp.isfinite(error).all(-1, keepdims=True), error, 0.0)
-    return jnp.einsum("ftri,ftrj->ftij", error, error)
-
-
-def _lagged(white: Array, log: Log, name: str, lags: int) -> tuple[jax.Array, jax.Array]:
-    """By filter (F, L), of (T, R, F, m): see `lagged`, over all runs; lags count the readings of the schedule."""
-    order = jnp.arange(len(log.dt))
-    valid = log.valid.get(name)
-    if valid is not None:
-        order = jnp.argsort(~jnp.asarray(valid).reshape(len(order), -1).any(1), stable=True)
-    return jax.vmap(lagged, in_axes=(2, None, None))(white, order, lags)
+def _outer(upper: Array, dim: int) -> jax.Array:
+    """Symmetric matrices (..., n, n) from their upper triangles (..., n (n + 1) / 2), row after row."""
+    index = np.zeros((dim, dim), int)
+    index[np.triu_indices(dim)] = np.arange(upper.shape[-1])
+    return upper[..., np.maximum(index, index.T)]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxfilt import consistency, metrics
 from jaxfilt.consistency import Consistency
 from jaxfilt.metrics import Whiteness
-from jaxfilt.tally import COVERAGES, ERROR_EDGES, NEES_EDGES, Moments, Sums, columns
+from jaxfilt.tally import COVERAGES, ERROR_EDGES, NEES_EDGES, Moments, Sums
 from jaxfilt.types import Status
 
 STATE = "state"
@@ -126,9 +126,7 @@ def scores(
         credible: noncredibility index and inclination (T,).
     """
     sensors, names = sorted(sums.dots), list(blocks)
-    place = columns(dim, len(blocks), sensors)
-    row = {name: Moments(*(a[:, at] for a in sums.rows)) for name, at in place.items()}
-    whole = {name: Moments(*(a[at] for a in sums.averages)) for name, at in place.items()}
+    row, whole = sums.rows, sums.averages
     square, square_total = _estimate(row["square"]), _estimate(whole["square"])
     index = [list(at) for at, _ in blocks.values()]
     variance = consistency.ratio(row["variance"].first, row["variance"].number)
@@ -139,7 +137,7 @@ def scores(
         nees_total[name] = _nees_total(whole, k, n, confidence)
     coverage, coverage_total = {}, {}
     for k, level in enumerate(COVERAGES):
-        hits, count = row["covered"].first[:, k], row["covered"].number[:, k]
+        hits, count = row["covered"].first[:, k], row["nees"].number[:, 0]
         coverage[level] = consistency.coverage(hits, count, level, confidence)
         coverage_total[level] = consistency.coverage_total(*_between(whole["covered"], k), level, confidence)
     error = whole["normalised"]

@@ -48,20 +48,32 @@ def simulate(
     dtype = jax.dtypes.canonicalize_dtype(belief.cov.dtype)
     belief, log = jax.tree.map(jnp.asarray, (belief, log))
     belief = jax.tree.map(lambda a: a.astype(dtype), belief)
-    start_key, key = jax.random.split(key)
-    names = [name for name in model.sensors if name in log.z]
 
-    def body(x: PyTree, row_key: tuple[Log, Array]) -> tuple[PyTree, tuple]:
-        row, key = row_key
-        keys = jax.random.split(key, 1 + len(names))
-        u = row.u if control is None else control(x, row.u)
-        x = jax.lax.cond(row.dt > 0, lambda x: _moved(model, x, u, row.dt, keys[0]), lambda x: x, x)
-        z = {name: _reading(model, name, x, row, keys[1 + i]) for i, name in enumerate(names)}
-        return x, (x, u, z)
+    def body(x: PyTree, row: tuple[Log, Array]) -> tuple[PyTree, tuple]:
+        x, read = simulated(model, x, *row, control)
+        return x, (x, read.u, read.z)
 
-    keys = jax.random.split(key, len(log.dt))
-    _, (truth, u, z) = jax.lax.scan(body, sample(belief, model.space, start_key), (log, keys))
+    start, keys = started(model.space, belief, key, len(log.dt))
+    _, (truth, u, z) = jax.lax.scan(body, start, (log, keys))
     return Simulation(truth, log._replace(u=u, z=z))
+
+
+def started(space: Space, belief: Gaussian, key: Array, steps: int) -> tuple[PyTree, Array]:
+    """The true state before the first row, and the keys of the rows (T,)."""
+    start, rows = jax.random.split(key)
+    return sample(belief, space, start), jax.random.split(rows, steps)
+
+
+def simulated(
+    model: Model, x: PyTree, row: Log, key: Array, control: Callable[[PyTree, PyTree], PyTree] | None = None
+) -> tuple[PyTree, Log]:
+    """One row: the true state after it, and the row with its input and its readings."""
+    names = [name for name in model.sensors if name in row.z]
+    keys = jax.random.split(key, 1 + len(names))
+    u = row.u if control is None else control(x, row.u)
+    x = jax.lax.cond(row.dt > 0, lambda x: _moved(model, x, u, row.dt, keys[0]), lambda x: x, x)
+    z = {name: _reading(model, name, x, row, keys[1 + i]) for i, name in enumerate(names)}
+    return x, row._replace(u=u, z=z)
 
 
 def sample(belief: Gaussian, space: Space, key: Array) -> PyTree:

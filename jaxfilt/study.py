@@ -14,13 +14,14 @@ import jax
 import numpy as np
 
 from jaxfilt.campaign import run
-from jaxfilt.chunk import NO_FAULT
 from jaxfilt.consistency import CONFIDENCE
 from jaxfilt.credibility import noncredibility
 from jaxfilt.fold import itself
+from jaxfilt.loop import Backend
 from jaxfilt.metrics import Blocks
 from jaxfilt.mismatch import Corruption
 from jaxfilt.scores import Diverged, Fault, Paired, Scores, Worst, paired, scores
+from jaxfilt.streaming import NO_FAULT
 from jaxfilt.tally import Sums, every
 from jaxfilt.task import Filters, Options, Task, seed, task_of
 from jaxfilt.totals import NOBODY, Records, Totals
@@ -102,6 +103,7 @@ def study(
     out: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[int, int], Any] | None = None,
+    backend: Backend = "auto",
 ) -> Study:
     """Monte Carlo study: simulate runs, run every filter on the same truth and readings, score them.
 
@@ -136,6 +138,7 @@ def study(
         out: folder to keep the state in, after each chunk.
         resume: go on with the study in ``out``, to as many runs as asked for now.
         progress: called with (runs done, runs) when the program is compiled and after each chunk.
+        backend: as in `jaxfilt.scan_runs`; over several devices XLA computes.
 
     Returns:
         `Study`. The same arguments give the same numbers, bit for bit, whatever the number of workers and however often
@@ -161,7 +164,7 @@ def study(
     """
     options = Options(
         runs, control, corrupt, truth_belief, view, blocks, confidence, chunk, workers, devices, examples, sample, lags,
-        out, resume, progress,
+        out, resume, progress, backend,
     )  # fmt: skip
     truth_theta = theta if truth_theta is None else truth_theta
     (result,), interrupted = conducted(
@@ -247,7 +250,7 @@ def _scores(
     """Those of filter number f over one of the two sets of runs."""
     own = jax.tree.map(lambda a: a[f], sums._replace(paired=()))
     worst = {b: Worst(float(np.sqrt(square[k])), int(run_of[k])) for k, b in enumerate(task.blocks)}
-    credible = _credible(totals.error[f], nees, own.outer, own.rows.number[:, 0], task.steps)
+    credible = _credible(totals.error[f], nees, own.outer, own.rows["error"].number[:, 0], task.steps)
     return scores(own, task.blocks, task.space.dim, task.confidence, worst, credible)
 
 

@@ -6,6 +6,7 @@ does not grow with the number of runs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ Blocks = tuple[tuple[int, ...], ...]
 
 
 class Moments(NamedTuple):
-    """Over runs: how many values were finite, their sum, and the sum of their squares."""
+    """Over runs: how many values were finite, their sum, and the sum of their squares; None: nobody asks for it."""
 
     number: Array
     first: Array
@@ -42,16 +43,16 @@ class Moments(NamedTuple):
 class Sums(NamedTuple):
     """What is added up over runs, for each filter (leading axis F).
 
-    ``rows`` (F, T, K) at each row and ``averages`` (F, K) of the runs' own averages over time, columns as in
-    `columns`; ``runs`` (F,) in the sums; ``outer`` (F, T, n, n) of ``e e'``; ``errors`` (F, n, bins) and ``run_nees``
-    (F, bins) histograms; ``dots`` and ``pairs`` (F, L) by sensor, the products of normalised innovations at each lag
-    and their number; ``paired`` (pairs of filters, B + 1) of the differences of two filters' averages: squared error
-    by block, log score.
+    By score, see `columns`: ``rows`` (F, T, k) at each row, ``averages`` (F, k) of the runs' own averages over time.
+    ``runs`` (F,) in the sums; ``outer`` (F, T, n, n) of ``e e'``; ``errors`` (F, n, bins) and ``run_nees`` (F, bins)
+    histograms; ``dots`` and ``pairs`` (F, L) by sensor, the products of normalised innovations at each lag and their
+    number; ``paired`` (pairs of filters, B + 1) of the differences of two filters' averages: squared error by block,
+    log score.
     """
 
     runs: Array
-    rows: Moments
-    averages: Moments
+    rows: dict[str, Moments]
+    averages: dict[str, Moments]
     outer: Array
     errors: Array
     run_nees: Array
@@ -60,46 +61,79 @@ class Sums(NamedTuple):
     paired: Moments
 
 
-def columns(dim: int, blocks: int, sensors: list[str]) -> dict[str, slice]:
-    """Where each score lies in a row's vector (K,): one array in place of many keeps the program small."""
-    sizes = {
-        "error": dim,
-        "variance": dim,
-        "normalised": dim,
-        "square": blocks,
-        "nees": 1 + blocks,
-        "nees_square": 1 + blocks,
-        "log_score": 1,
-        "covered": len(COVERAGES),
-    }
-    for sensor in sensors:
-        sizes |= {f"{what} {sensor}": 1 for what in ("nis", "dof", "used", "refused")}
+class Columns(NamedTuple):
+    """Where each score lies ``at`` in a row's vector (K,): one array in place of many keeps the program small.
+
+    Parts of it are ``summed`` over runs at each row, ``counted`` there, ``squared`` there, or ``averaged`` over time.
+    """
+
+    at: dict[str, slice]
+    summed: slice
+    counted: slice
+    squared: slice
+    averaged: slice
+
+    def named(self, part: slice, values: Array) -> dict[str, Array]:
+        """By score, what a part (..., k) holds of it."""
+        inside = {name: at for name, at in self.at.items() if part.start <= at.start and at.stop <= part.stop}
+        return {name: values[..., at.start - part.start : at.stop - part.start] for name, at in inside.items()}
+
+
+def columns(dim: int, blocks: int, sensors: Sequence[str]) -> Columns:
+    """Those of n = ``dim`` and so many blocks, in an order that makes each part one slice."""
+    sizes = {f"{what} {sensor}": 1 for sensor in sensors for what in ("nis", "dof", "used", "refused")}
+    sizes |= {"variance": dim, "error": dim, "square": blocks, "log_score": 1, "nees": 1 + blocks}
+    sizes |= {"covered": len(COVERAGES), "normalised": dim, "nees_square": 1 + blocks}
     ends = np.cumsum(list(sizes.values()))
-    return {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    at = {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    return Columns(
+        at,
+        summed=slice(0, at["covered"].stop),
+        counted=slice(at["variance"].start, at["nees"].stop),
+        squared=slice(at["error"].start, at["log_score"].stop),
+        averaged=slice(at["square"].start, at["nees_square"].stop),
+    )
 
 
-def score(blocks: Blocks, error: Array, cov: Array, info: dict[str, Info]) -> tuple[jax.Array, dict[str, jax.Array]]:
+def score(
+    place: Columns, blocks: Blocks, error: Array, cov: Array, info: dict[str, Info]
+) -> tuple[jax.Array, dict[str, jax.Array]]:
     """One filter at one row: the vector (K,) of `columns`, and by sensor the normalised innovation ``L^-1 r`` (m,)."""
     n = len(error)
     L = linalg.cholesky(cov)
     w = linalg.forward_solve(L, error)
     state, variance = w @ w, jnp.diagonal(cov)
-    by_block = [state if len(b) == n else metrics.nees(error[b,], cov[np.ix_(b, b)]) for b in blocks]
+    nees = jnp.stack([state, *(_block_nees(b, w, error, cov) for b in blocks)])
     levels = jnp.asarray([float(chisquare.quantile(level, n)) for level in COVERAGES], error.dtype)
-    covered = jnp.where(jnp.isfinite(state), (state <= levels).astype(error.dtype), jnp.nan)
-    log_score = -0.5 * (state + linalg.log_determinant(L) + n * float(np.log(2 * np.pi)))
-    values = [error, variance, error / jnp.sqrt(variance), jnp.stack([jnp.square(error[b,]).sum() for b in blocks])]
-    nees = jnp.stack([state, *by_block])
-    values += [nees, jnp.square(nees), log_score[None], covered]
+    values = {
+        "variance": variance,
+        "error": error,
+        "square": jnp.stack([sum(jnp.square(error[i]) for i in b) for b in blocks]),
+        "log_score": -0.5 * (state + linalg.log_determinant(L) + n * float(np.log(2 * np.pi)))[None],
+        "nees": nees,
+        "covered": jnp.where(jnp.isfinite(state), (state <= levels).astype(error.dtype), jnp.nan),
+        "normalised": error / jnp.sqrt(variance),
+        "nees_square": jnp.square(nees),
+    }
     white = {}
     for name, i in info.items():
         nis, dof = metrics.used(i)
-        marks = jnp.stack([a.astype(error.dtype) for a in (dof, dof > 0, i.status == Status.GATED)])
-        values += [nis[None], marks]
+        marks = {"dof": dof, "used": dof > 0, "refused": i.status == Status.GATED}
+        values |= {f"{what} {name}": mark.astype(error.dtype)[None] for what, mark in marks.items()}
+        values[f"nis {name}"] = nis[None]
         S = jnp.where(dof > 0, i.S, jnp.eye(len(i.S), dtype=i.S.dtype))  # where it was silent S is 0: no root
         whitened = linalg.forward_solve(linalg.cholesky(S), i.innovation)
         white[name] = jnp.where(dof > 0, whitened, 0.0)
-    return jnp.concatenate(values), white
+    return jnp.concatenate([values[name] for name in place.at]), white
+
+
+def _block_nees(block: tuple[int, ...], w: Array, error: Array, cov: Array) -> jax.Array:
+    """The NEES of some components; ``w = L^-1 e`` of all of them has that of the first few, whose factor is in L."""
+    k = len(block)
+    if sorted(block) == list(range(k)):
+        return w[:k] @ w[:k]
+    picked = jnp.stack([jnp.stack([cov[i, j] for j in block]) for i in block])
+    return metrics.nees(jnp.stack([error[i] for i in block]), picked)
 
 
 def moments(values: Array, there: Array, axis: int) -> Moments:
@@ -110,10 +144,9 @@ def moments(values: Array, there: Array, axis: int) -> Moments:
 
 def histogram(values: Array, there: Array, edges: np.ndarray) -> jax.Array:
     """Counts (bins,) between the edges; what is beyond them falls into the outermost bins."""
-    inner = jnp.asarray(edges[1:-1], values.dtype).reshape((1,) * values.ndim + (-1,))
-    below = (values[..., None] < inner) & there[..., None]
-    cumulative = below.reshape(-1, len(edges) - 2).sum(0)
-    return jnp.diff(cumulative, prepend=0, append=there.sum())
+    # One edge after the other: all at once would need memory for each value and edge.
+    below = jax.lax.map(lambda edge: ((values < edge) & there).sum(), jnp.asarray(edges[1:-1], values.dtype))
+    return jnp.diff(below, prepend=0, append=there.sum())
 
 
 def every(steps: int) -> int:
@@ -122,22 +155,6 @@ def every(steps: int) -> int:
 
 
 def error_histogram(normalised: Array, weights: Array) -> jax.Array:
-    """Counts (n, bins) of the normalised errors (T, R, n) of runs with weights (R,) True, at some rows."""
-    step = every(len(normalised))
-    some = jnp.moveaxis(normalised[step - 1 :: step], -1, 0)
-    return jax.vmap(histogram, in_axes=(0, 0, None))(some, jnp.isfinite(some) & weights[None, None], ERROR_EDGES)
-
-
-def lagged(white: Array, order: Array, lags: int) -> tuple[jax.Array, jax.Array]:
-    """Of normalised innovations (T, R, m) that are 1, 2, ... readings apart: sums (lags,) of products, their number.
-
-    What was not used is exactly 0 in ``white``, and what was used never is: the noise is continuous.
-    """
-    ordered = white[order]
-    later = jnp.concatenate([ordered, jnp.zeros((lags, *ordered.shape[1:]), ordered.dtype)])
-
-    def at(lag: Array) -> tuple[jax.Array, jax.Array]:
-        product = ordered * jax.lax.dynamic_slice_in_dim(later, lag, len(ordered))
-        return product.sum(), (product != 0).sum()
-
-    return jax.lax.map(at, jnp.arange(1, lags + 1))
+    """Counts (n, bins) of the normalised errors (R, rows, n) of runs with weights (R,) True."""
+    errors = jnp.moveaxis(normalised, -1, 0)
+    return jax.vmap(histogram, in_axes=(0, 0, None))(errors, jnp.isfinite(errors) & weights[None, :, None], ERROR_EDGES)

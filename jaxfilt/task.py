@@ -16,13 +16,21 @@ from jaxfilt import log as logs
 from jaxfilt.chunk import Plan
 from jaxfilt.consistency import CONFIDENCE
 from jaxfilt.fold import itself
+from jaxfilt.loop import Backend
 from jaxfilt.metrics import Blocks
 from jaxfilt.mismatch import Corruption
 from jaxfilt.scores import STATE
+from jaxfilt.tally import every
 from jaxfilt.types import Array, Filter, Gaussian, Log, Model, PyTree, Space
 
 MEMORY = 64e6
-"""Bytes that one chunk may take, about: what is simulated is kept until the filters have read it."""
+"""Bytes that a chunk may take, about: what is kept of each run until all of them are done."""
+
+KEY = 8
+"""Bytes of a random key, of JAX's default generator."""
+
+MOST = 2000
+"""Runs of a chunk on one device: from some hundreds on, more at a time are not faster (measured)."""
 
 Filters = Mapping[str, Callable[[PyTree], Filter]]
 """name -> (theta -> filter)"""
@@ -47,6 +55,7 @@ class Options(NamedTuple):
     out: str | Path | None = None
     resume: bool = False
     progress: Callable[[int, int], Any] | None = None
+    backend: Backend = "auto"
 
 
 class Task(NamedTuple):
@@ -123,6 +132,7 @@ def task_of(
         lags=max(1, min(o.lags, len(log.dt) - 1)),
         swept=swept,
         generator=str(jax.random.key_impl(key)),
+        backend=o.backend if len(devices) == 1 else "xla",
     )
     arguments = []
     for i in range(2):
@@ -220,13 +230,15 @@ def _chunk(
         old = checkpoint.read_manifest(Path(o.out))
         if old is not None:
             return old["chunk"]
-    size = sum(np.size(leaf) for leaf in jax.tree.leaves(space.origin))
-    readings = sum(np.size(leaf) // len(log.dt) for leaf in jax.tree.leaves(log.z))
-    size += readings + sum(np.size(leaf) // len(log.dt) for leaf in jax.tree.leaves(log.u if o.control else ()))
-    # Of each filter: error, normalised error, NEES, and each sensor's normalised innovation.
-    scored = 2 * space.dim + 1 + len(o.blocks or range(space.dim)) + readings
-    size += settings * len(filters) * scored
-    most = devices * max(1, int(MEMORY / (size * len(log.dt) * dtype.itemsize)))
+    steps = len(log.dt)
+    numbers = lambda tree: sum(np.size(leaf) // steps for leaf in jax.tree.leaves(tree))  # noqa: E731
+    # Of each row the random key, and where something happens to the readings all that was simulated, before and after.
+    simulated = sum(np.size(leaf) for leaf in jax.tree.leaves(space.origin)) + numbers(log.u if o.control else ())
+    row = KEY + dtype.itemsize * (0 if o.corrupt is None else simulated + 2 * numbers(log.z))
+    # Of some rows, by filter: error, normalised error, NEES.
+    some = dtype.itemsize * settings * len(filters) * (2 * space.dim + 1)
+    size = row * steps + some * (steps // every(steps))
+    most = devices * max(1, min(MOST, int(MEMORY / size)))
     chunks = -(-o.runs // most)
     chunks = workers * -(-chunks // workers)
     return -(-o.runs // chunks)

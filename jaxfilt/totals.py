@@ -7,7 +7,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxfilt.chunk import NO_FAULT, Chunk, Each, Examples
+from jaxfilt.chunk import Chunk, Each, Examples
+from jaxfilt.streaming import NO_FAULT
 from jaxfilt.tally import Sums
 from jaxfilt.types import Array
 

@@ -70,7 +70,7 @@ ONE: list[Callable[[jax.Array], jax.Array]] = [
     lambda x: jnp.flip(x),
     lambda x: lax.cond(x.sum() > 0, lambda x: x + 1, lambda x: 2 * x, x),
     lambda x: lax.switch(_index(x, 3), [lambda x: x, lambda x: -x, lambda x: x * 3], x),
-    lambda x: lax.fori_loop(0, 3, lambda i, c: 0.5 * c + i, x),
+    lambda x: lax.fori_loop(0, 3, lambda i, c: 0.5 * c + i.astype(x.dtype), x),
     lambda x: jax.jit(lambda x: x * x + x)(x),
     lambda x: jax.grad(lambda x: (jnp.sin(x) * x).sum())(x),
     lambda x: jax.jvp(lambda x: jnp.arctan2(x, x + 1), (x,), (x,))[1],

@@ -63,7 +63,7 @@ def test_a_file_imports_only_lower_floors(path: Path):
 def test_only_linalg_factorizes(path: Path):
     calls = {"cholesky", "solve", "qr", "eigh", "inv", "cho_factor", "cho_solve"}
     host_side = {"bound.py", "check.py", "credibility.py", "curvature.py", "diagnose.py", "doors.py", "identify.py"}
-    if path.name == "linalg.py":
+    if path.name == "linalg.py" or room(path) == "lanes":  # which only names them, as operations of JAX
         return
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Attribute) and node.attr in calls and path.name not in host_side:
