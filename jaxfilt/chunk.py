@@ -169,12 +169,12 @@ def _chunk(
     sensors = {name: own_model.sensors[name].space.dim for name in robot.sensors if name in log.z}
     place = columns(space.dim, len(plan.blocks), list(sensors))
     own = jax.vmap(lambda number: jax.random.fold_in(_key(plan, key), number))(numbers)
-    draw, x, rows, axes = _drawn(plan, robot, origin, truth_theta, log, own)
+    draw, x, keys, rows, axes = _drawn(plan, robot, origin, truth_theta, log, own)
 
-    def body(weight: Array, carry: tuple, row: tuple) -> tuple:
-        x, held = carry
+    def body(constants: tuple[Array, Array], carry: tuple, row: tuple) -> tuple:
+        (weight, key), (x, held) = constants, carry
         # A fence: XLA would draw the noises anew for each of the many numbers that a reading goes into.
-        x, read = jax.lax.optimization_barrier(draw(x, row[0]))
+        x, read = jax.lax.optimization_barrier(draw(key, x, row[0]))
         truth = plan.view(x)
         held, found = judged(bank, place, plan.blocks, list(sensors), weight, held, read, truth, row[1])
         return (x, held), (found[:2], found[2:], Examples(truth, held[0]))
@@ -182,7 +182,7 @@ def _chunk(
     beliefs, told = dict.fromkeys(bank, start), nothing(place, len(bank), plan.lags, sensors, np.dtype(dtype))
     (_, (_, told)), (added, some, examples) = loop(
         body,
-        weights,
+        (weights, keys),
         (x, (beliefs, told)),
         (rows, instants(log)),
         runs=len(numbers),
@@ -199,32 +199,34 @@ def _key(plan: Plan, data: Array) -> Array:
 
 def _drawn(
     plan: Plan, robot: Model, origin: Gaussian, truth_theta: PyTree, log: Log, own: Array
-) -> tuple[Callable[[PyTree, tuple], tuple[PyTree, Log]], PyTree, tuple, tuple]:
-    """Where truth and readings come from, for runs with their ``own`` keys (R,): a function of (true state, row) that
-    returns the next state and the row as it was read; the state before the first row; the rows, and their axes.
+) -> tuple[Callable[[Array, PyTree, tuple], tuple[PyTree, Log]], PyTree, Array, tuple, tuple]:
+    """Where truth and readings come from, for runs with their ``own`` keys (R,): a function of (key, true state, row)
+    that returns the next state and the row as it was read; the states before the first row and the keys of the runs;
+    the rows, and their axes.
 
     They are drawn as they are needed, unless something happens to the readings: that may look at the whole run.
     """
-    x, keys = jax.vmap(lambda key: started(robot.space, origin, key, len(log.dt)))(own)
+    x, keys = jax.vmap(lambda key: started(robot.space, origin, key))(own)
     keys = jax.random.key_data(keys)
+    rows = (log, jnp.arange(len(log.dt)))
 
-    def draw(x: PyTree, row: tuple[Log, Array]) -> tuple[PyTree, Log]:
-        return simulated(robot, x, row[0], _key(plan, row[1]), plan.control)
+    def draw(key: Array, x: PyTree, row: tuple[Log, Array]) -> tuple[PyTree, Log]:
+        return simulated(robot, x, *row, _key(plan, key), plan.control)
 
     if plan.corrupt is None:
-        return draw, x, (log, keys), (None, 0)
+        return draw, x, keys, rows, (None, None)
 
-    def body(_: tuple, x: PyTree, row: tuple[Log, Array]) -> tuple:
-        x, read = draw(x, row)
+    def body(key: Array, x: PyTree, row: tuple[Log, Array]) -> tuple:
+        x, read = draw(key, x, row)
         return x, ((x, read.z, read.u if plan.control else ()),)
 
     _, ((truth, z, u),) = loop(
         body,
-        (),
+        keys,
         x,
-        (log, keys),
+        rows,
         runs=len(own),
-        axes=(None, 0, (None, 0)),
+        axes=(0, 0, (None, None)),
         outputs=(Kept(),),
         backend=plan.backend,
     )
@@ -243,7 +245,7 @@ def _drawn(
     spoilt = jax.vmap(spoil)(truth, z, u, own)
     rows = structures[0].unflatten([b if a is None else a for a, b in zip(alike, spoilt, strict=True)])
     axes = structures[0].unflatten([0 if a is None else None for a in alike])
-    return lambda x, row: (row[1], row[0]), x, (rows, truth), (axes, 0)
+    return lambda key, x, row: (row[1], row[0]), x, keys, (rows, truth), (axes, 0)
 
 
 def _summed(plan: Plan, place: Columns, dim: int, weights: Array, told: Told, row: Row, examples: Examples) -> Chunk:

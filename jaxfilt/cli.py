@@ -6,7 +6,7 @@ import functools
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import jax
 
@@ -16,6 +16,7 @@ from jaxfilt.arguments import Mistake, explained
 from jaxfilt.bound import Bound, cramer_rao
 from jaxfilt.cli_tune import tune
 from jaxfilt.command import MISSING, built, finish, kept, one_of, typed, typer
+from jaxfilt.loop import Backend
 from jaxfilt.review import replayed
 from jaxfilt.study import Interrupted, Study
 from jaxfilt.study import study as monte_carlo
@@ -92,6 +93,7 @@ def study(
     ] = "",
     dtype: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
     chunk: Annotated[int, typer.Option(help="Runs at once; default by memory.")] = 0,
+    backend: Annotated[str, typer.Option(help="auto, xla, or lanes (needs the extra fast).")] = "auto",
     out: Annotated[str, typer.Option(help="Folder for the results; default jaxfilt-out/study-NAME.")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder.")] = False,
     names: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
@@ -102,6 +104,7 @@ def study(
         return 0
     asked.at_least(1, runs=runs, steps=steps)
     asked.at_least(0, seed=seed, chunk=chunk)
+    asked.one_of("backend", backend, get_args(Backend))
     makers = asked.makers(filters)
     believed = {name: values[0] for name, values in asked.noise_factors(assume or [], "--assume").items()}
     over = asked.noise_factors(sweep or [], "--sweep")
@@ -117,6 +120,7 @@ def study(
         "truth_belief": chosen.belief,
         "blocks": chosen.blocks,
         "chunk": chunk or None,
+        "backend": backend,
         "out": folder,
         "resume": resume,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import jax
 
@@ -13,6 +13,7 @@ from jaxfilt import datasets, recordings, scenarios, terminal, tuning_data
 from jaxfilt.arguments import Mistake, explained
 from jaxfilt.command import built, finish, kept, typed, typer
 from jaxfilt.fit import Fit
+from jaxfilt.loop import Backend
 from jaxfilt.study import Interrupted
 from jaxfilt.tune import tune as tuned
 from jaxfilt.tuning.setup import Uninfluential
@@ -59,6 +60,7 @@ def tune(
     ] = "",
     seed: Annotated[int, typer.Option(help="Of the random numbers; the same seed, the same result.")] = 0,
     dtype: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
+    backend: Annotated[str, typer.Option(help="auto, xla, or lanes (needs the extra fast).")] = "auto",
     out: Annotated[str, typer.Option(help="Folder for the results; default jaxfilt-out/tune-NAME.")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the tuning in the folder.")] = False,
     names: Annotated[bool, typer.Option("--list", help="List the scenarios and recordings and exit.")] = False,
@@ -72,6 +74,7 @@ def tune(
     asked.at_least(0, seed=seed, batch=batch, pieces=pieces, **{"burn-in": burn_in})
     make = asked.maker(filter)
     asked.one_of("objective", objective, ("", *tuning_data.OBJECTIVES))
+    asked.one_of("backend", backend, get_args(Backend))
     if not 0 < wrong < float("inf"):
         raise Mistake(f"--from: expected a factor above 0, got {wrong:g}")
     limits = asked.clip(clip)
@@ -107,6 +110,7 @@ def tune(
             "batch": batch or None,
             "length": pieces or None,
             "starts": starts,
+            "backend": backend,
             "clip": limits,
             "key": jax.random.key(seed),
             "out": folder,

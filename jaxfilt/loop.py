@@ -172,7 +172,7 @@ def checkpointed(body: Callable, carry: PyTree, xs: PyTree, segment: int | None 
 
 
 def _xla(
-    body: Body, arguments: tuple, runs: int, axes: tuple, outputs: Outputs, segment: int | None
+    body: Body, arguments: tuple[PyTree, PyTree, PyTree], runs: int, axes: tuple, outputs: Outputs, segment: int | None
 ) -> tuple[PyTree, tuple]:
     def one(constants: PyTree, start: PyTree, rows: PyTree) -> tuple[PyTree, list]:
         def row_of(carry: PyTree, row: PyTree) -> tuple[PyTree, list]:
@@ -234,7 +234,9 @@ def _thinned(
     return carry, [t if yes else jax.tree.map(lambda a: a.reshape(steps, *a.shape[2:]), t) for yes, t in whole]
 
 
-def _lanes(body: Body, arguments: tuple, runs: int, axes: tuple, outputs: Outputs) -> tuple[PyTree, tuple]:
+def _lanes(
+    body: Body, arguments: tuple[PyTree, PyTree, PyTree], runs: int, axes: tuple, outputs: Outputs
+) -> tuple[PyTree, tuple]:
     from jaxfilt.lanes.trace import Stored
     from jaxfilt.lanes.trees import over_runs
 

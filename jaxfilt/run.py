@@ -114,22 +114,21 @@ def scan_runs(
     if unknown:
         raise ValueError(f"batched: expected fields of {Log._fields}, got {unknown}")
     belief_axis = 0 if jnp.ndim(belief.cov) == 3 else None
-    axes = tuple(0 if name in batched else None for name in Log._fields)
-
+    axes: Any = Log._make(0 if name in batched else None for name in Log._fields)
     differ = [leaf for name in batched for leaf in jax.tree.leaves(getattr(log, name))]
     if belief_axis is None and not differ:
         raise ValueError(f"batched: expected a belief or fields of the log that differ by run, got {tuple(batched)}")
     runs = len(belief.cov if belief_axis == 0 else differ[0])
-    every = (belief_axis, *axes)
-    checked = jax.vmap(lambda b, *fields: _checked(filter, b, Log(*fields)), every, (belief_axis, Log(*axes)))
-    belief, log = checked(belief, *log)
+    look = jax.vmap(lambda b, *fields: _checked(filter, b, Log(*fields)), (belief_axis, *axes), (belief_axis, axes))
+    belief, log = look(belief, *log)
 
     def body(_: PyTree, b: Gaussian, row: Log) -> tuple[Gaussian, tuple]:
         b, info = filter.step(b, row)
         return b, (store(b, info),)
 
-    placed = (None, belief_axis, Log(*axes))
-    return loop(body, (), belief, log, runs=runs, axes=placed, outputs=[Kept()], segment=segment, backend=backend)[1][0]
+    options: dict[str, Any] = {"runs": runs, "axes": (None, belief_axis, axes), "segment": segment, "backend": backend}
+    _, (stored,) = loop(body, (), belief, log, outputs=[Kept()], **options)
+    return stored
 
 
 def log_likelihood(filter: Filter, belief: Gaussian, log: Log, segment: int | None = None) -> jax.Array:

@@ -49,27 +49,33 @@ def simulate(
     belief, log = jax.tree.map(jnp.asarray, (belief, log))
     belief = jax.tree.map(lambda a: a.astype(dtype), belief)
 
+    start, key = started(model.space, belief, key)
+
     def body(x: PyTree, row: tuple[Log, Array]) -> tuple[PyTree, tuple]:
-        x, read = simulated(model, x, *row, control)
+        x, read = simulated(model, x, *row, key, control)
         return x, (x, read.u, read.z)
 
-    start, keys = started(model.space, belief, key, len(log.dt))
-    _, (truth, u, z) = jax.lax.scan(body, start, (log, keys))
+    _, (truth, u, z) = jax.lax.scan(body, start, (log, jnp.arange(len(log.dt))))
     return Simulation(truth, log._replace(u=u, z=z))
 
 
-def started(space: Space, belief: Gaussian, key: Array, steps: int) -> tuple[PyTree, Array]:
-    """The true state before the first row, and the keys of the rows (T,)."""
+def started(space: Space, belief: Gaussian, key: Array) -> tuple[PyTree, Array]:
+    """The true state before the first row, and the key of all rows."""
     start, rows = jax.random.split(key)
-    return sample(belief, space, start), jax.random.split(rows, steps)
+    return sample(belief, space, start), rows
 
 
 def simulated(
-    model: Model, x: PyTree, row: Log, key: Array, control: Callable[[PyTree, PyTree], PyTree] | None = None
+    model: Model,
+    x: PyTree,
+    row: Log,
+    number: Array,
+    key: Array,
+    control: Callable[[PyTree, PyTree], PyTree] | None = None,
 ) -> tuple[PyTree, Log]:
-    """One row: the true state after it, and the row with its input and its readings."""
+    """One row, by its number: the true state after it, and the row with its input and its readings."""
     names = [name for name in model.sensors if name in row.z]
-    keys = jax.random.split(key, 1 + len(names))
+    keys = jax.random.split(jax.random.fold_in(key, number), 1 + len(names))
     u = row.u if control is None else control(x, row.u)
     x = jax.lax.cond(row.dt > 0, lambda x: _moved(model, x, u, row.dt, keys[0]), lambda x: x, x)
     z = {name: _reading(model, name, x, row, keys[1 + i]) for i, name in enumerate(names)}

@@ -26,9 +26,6 @@ from jaxfilt.types import Array, Filter, Gaussian, Log, Model, PyTree, Space
 MEMORY = 64e6
 """Bytes that a chunk may take, about: what is kept of each run until all of them are done."""
 
-KEY = 8
-"""Bytes of a random key, of JAX's default generator."""
-
 MOST = 2000
 """Runs of a chunk on one device: from some hundreds on, more at a time are not faster (measured)."""
 
@@ -232,9 +229,9 @@ def _chunk(
             return old["chunk"]
     steps = len(log.dt)
     numbers = lambda tree: sum(np.size(leaf) // steps for leaf in jax.tree.leaves(tree))  # noqa: E731
-    # Of each row the random key, and where something happens to the readings all that was simulated, before and after.
+    # Of each row, where something happens to the readings, all that was simulated, before and after.
     simulated = sum(np.size(leaf) for leaf in jax.tree.leaves(space.origin)) + numbers(log.u if o.control else ())
-    row = KEY + dtype.itemsize * (0 if o.corrupt is None else simulated + 2 * numbers(log.z))
+    row = dtype.itemsize * (0 if o.corrupt is None else simulated + 2 * numbers(log.z))
     # Of some rows, by filter: error, normalised error, NEES.
     some = dtype.itemsize * settings * len(filters) * (2 * space.dim + 1)
     size = row * steps + some * (steps // every(steps))

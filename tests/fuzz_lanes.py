@@ -29,6 +29,11 @@ def _bounded(x: jax.Array) -> jax.Array:
     return jnp.where(jnp.abs(x) > 1e8, jnp.sign(x), x)
 
 
+def _unsigned(x: jax.Array) -> jax.Array:
+    """Without the sign of a zero, which no lane keeps through ``x + 0``."""
+    return jnp.where(x == 0, 0.0, x)
+
+
 def _tame(x: jax.Array) -> jax.Array:
     """What LAPACK makes of a NaN or inf depends on whose LAPACK it is."""
     return jnp.where(jnp.abs(x) < 1e3, x, 1.0)
@@ -53,7 +58,7 @@ ONE: list[Callable[[jax.Array], jax.Array]] = [
     lambda x: jnp.log(jnp.abs(x) + 0.1),
     lambda x: jnp.log1p(jnp.abs(x)),
     lambda x: jnp.sqrt(x),
-    lambda x: 1.0 / x,
+    lambda x: 1.0 / _unsigned(x),
     lambda x: lax.rsqrt(jnp.abs(x) + 0.5),
     lambda x: jax.nn.sigmoid(x),
     lambda x: lax.erf(x),
@@ -115,12 +120,14 @@ SQUARE: list[Callable[[jax.Array], jax.Array]] = [
     jnp.diagonal,
     lambda x: jnp.linalg.cholesky(_positive(x)),
     lambda x: jnp.linalg.solve(_regular(x), _tame(x)),
-    lambda x: jnp.linalg.det(_tame(x)),
+    lambda x: jnp.linalg.det(_regular(x)),
     lambda x: jax.scipy.linalg.solve_triangular(_regular(x), _tame(x), lower=True),
 ]
 
 TWO: list[Callable[[jax.Array, jax.Array], jax.Array]] = [
-    jnp.add, jnp.subtract, jnp.multiply, jnp.divide, jnp.maximum, jnp.minimum, jnp.arctan2,
+    jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum,
+    lambda x, y: x / _unsigned(y),
+    lambda x, y: jnp.arctan2(_unsigned(x), _unsigned(y)),
     lambda x, y: jnp.where(x < y, x, y * 2),
     lambda x, y: jnp.where(x == y, 1.0, x),
     lambda x, y: lax.rem(x, jnp.where(jnp.abs(y) < 0.1, 1.0, y)),

@@ -72,11 +72,11 @@ def agree(function: Callable[..., Any], *args: np.ndarray, tolerance: float = 0.
     """
     got, want = computed(function, *args, strict=strict), expected(function, *args)
     assert len(got) == len(want)
-    for ours, theirs in zip(got, want, strict=True):
+    for k, (ours, theirs) in enumerate(zip(got, want, strict=True)):
         assert ours.shape == theirs.shape
         assert ours.dtype == theirs.dtype or not ours.size
         if theirs.dtype.kind == "f" and tolerance:
             scale = np.max(np.abs(theirs), initial=0, where=np.isfinite(theirs))
-            np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=tolerance * scale)
+            np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=tolerance * scale, err_msg=f"result {k}")
         else:
-            np.testing.assert_array_equal(ours, theirs)
+            np.testing.assert_array_equal(ours, theirs, err_msg=f"result {k}")

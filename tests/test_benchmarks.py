@@ -57,6 +57,16 @@ def test_everybody_here_gets_the_answer(problem, work, name):
     assert record["run"] > 0
 
 
+@pytest.mark.parametrize("work", ["W1", "W2", "W3", "W4", "W5"])
+def test_lanes_are_as_right_as_xla(problem, work):
+    off = []
+    for name in ("jaxfilt lanes", "jaxfilt xla"):
+        record = measure.measured(REGISTRY[name], problem(work), repeats=1, seconds=0.0)
+        off.append([record[key] for key in ("mean_off", "variance_off", "value_off", "gradient_off") if key in record])
+    for lanes, xla in zip(*off, strict=True):
+        assert lanes <= 3 * xla + 1e-13
+
+
 @pytest.mark.parametrize("name", [name for name in ("jaxfilt xla", "NumPy", "C", "C, dense") if name in HERE])
 def test_float32_is_float32(problem, name):
     found = problem("W2", "float32")

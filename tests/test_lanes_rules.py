@@ -88,29 +88,30 @@ def _same_signs(function: Callable, *args: np.ndarray) -> None:
             np.testing.assert_array_equal(np.signbit(got)[there], np.signbit(want)[there])
 
 
-@pytest.mark.parametrize("dtype", FLOAT)
-@pytest.mark.parametrize("name", UNARY)
-def test_one_float(name: str, dtype: type) -> None:
-    _same_signs(UNARY[name], *specials(dtype))
+def _all(functions: dict[str, Callable]) -> Callable:
+    """All of them in one program: compiling is what takes the time."""
+    return lambda *args: [function(*args) for function in functions.values()]
 
 
 @pytest.mark.parametrize("dtype", FLOAT)
-@pytest.mark.parametrize("name", BINARY)
-def test_two_floats(name: str, dtype: type) -> None:
-    agree(BINARY[name], *specials(dtype, 2))
+def test_one_float(dtype: type) -> None:
+    _same_signs(_all(UNARY), *specials(dtype))
+
+
+@pytest.mark.parametrize("dtype", FLOAT)
+def test_two_floats(dtype: type) -> None:
+    agree(_all(BINARY), *specials(dtype, 2))
 
 
 @pytest.mark.parametrize("dtype", INTEGER)
 def test_one_integer(dtype: type) -> None:
-    for name, function in ON_INTEGERS.items():
-        if not (name in ("neg", "abs") and np.dtype(dtype).kind == "u"):
-            agree(function, *specials(dtype))
+    signed = ("neg", "abs") if np.dtype(dtype).kind == "u" else ()
+    agree(_all({name: f for name, f in ON_INTEGERS.items() if name not in signed}), *specials(dtype))
 
 
 @pytest.mark.parametrize("dtype", INTEGER)
 def test_two_integers(dtype: type) -> None:
-    for function in BETWEEN_INTEGERS.values():
-        agree(function, *specials(dtype, 2))
+    agree(_all(BETWEEN_INTEGERS), *specials(dtype, 2))
 
 
 @pytest.mark.parametrize("op", ["eq", "ne", "bitwise_and", "bitwise_or", "bitwise_xor", "max", "min"])
@@ -129,7 +130,8 @@ def test_a_number_picked_by_flags_and_by_numbers() -> None:
 
 @pytest.mark.parametrize("dtype", FLOAT)
 def test_clamp(dtype: type) -> None:
-    agree(lambda x: lax.clamp(jnp.asarray(-1, dtype), x, jnp.asarray(2, dtype)), *specials(dtype))
+    for low, high in ((-1, 2), (2, -1)):
+        agree(lambda x, a=low, b=high: lax.clamp(jnp.asarray(a, dtype), x, jnp.asarray(b, dtype)), *specials(dtype))
 
 
 def test_next_float() -> None:
@@ -200,10 +202,14 @@ COMBINED = {
 }
 
 
-@pytest.mark.parametrize("dtype", FLOAT)
 @pytest.mark.parametrize("name", COMBINED)
-def test_combined(name: str, dtype: type) -> None:
-    agree(COMBINED[name], numbers(2, 3, 4, dtype=dtype), tolerance=4 * float(np.finfo(dtype).eps))
+def test_combined(name: str) -> None:
+    agree(COMBINED[name], numbers(2, 3, 4), tolerance=1e-15)
+
+
+@pytest.mark.parametrize("name", ["dot", "sum", "max", "argmax", "sort"])
+def test_combined_in_single_precision(name: str) -> None:
+    agree(COMBINED[name], numbers(2, 3, 4, dtype=np.float32), tolerance=1e-6)
 
 
 @pytest.mark.parametrize("name", ["max", "min", "sum", "argmax", "argmin", "cummax", "sort", "argsort"])
@@ -340,7 +346,7 @@ def test_an_index_that_is_not_known(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", INDEXED)
-@pytest.mark.parametrize("index", [(0, 1), (3, 2), (-1, -2), (5, -7)])
+@pytest.mark.parametrize("index", [(3, -2), (5, -7)])
 def test_an_index_that_is_known(name: str, index: tuple[int, int]) -> None:
     def function(x: jax.Array) -> jax.Array:
         return INDEXED[name](x, jnp.asarray(index, jnp.int32))

@@ -18,7 +18,7 @@ KEY = jax.random.key(3)
 
 
 def swing(g, carry, row):
-    """A body with what bodies have: a matrix that stays symmetric, an integer, a flag, a mask, a constant of the run."""
+    """A body with what bodies have: a symmetric matrix, an integer, a flag, a mask, a constant of the run."""
     x, P, count, seen = carry
     u, there = row
     x = jnp.stack([x[0] + 0.1 * x[1], x[1] - 0.1 * g * jnp.sin(x[0]) + u[0]])
@@ -318,9 +318,7 @@ def test_a_carry_that_changes_is_refused():
 # Filters.
 
 
-@pytest.mark.parametrize(
-    "build", [jf.ekf, jf.ukf, jf.ckf, lambda m: jf.iekf(m, 2), lambda m: jf.ekf(m, gate=0.9)]
-)
+@pytest.mark.parametrize("build", [jf.ekf, jf.ukf, jf.ckf, lambda m: jf.iekf(m, 2), lambda m: jf.ekf(m, gate=0.9)])
 def test_a_filter_of_a_car_with_masks_and_reports(build):
     robot = scenario("car")
     model, start, log = robot.model(robot.theta), robot.belief(robot.theta), robot.schedule(12)

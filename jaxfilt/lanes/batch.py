@@ -191,11 +191,31 @@ class Loop:
 
         def pulled(at: Parts, slope: Arrays, behind: list[tuple[jax.Array, bool]]) -> Arrays:
             fast = pair(False)
-            engine = Engine(operands, results, fast, lambda: pair(True))
+            engine = Engine(operands, results, fast, _as_now(lambda: pair(True)))
             name = self._name() + fast.forth.kernel.digest + fast.back.kernel.digest
             return _called(engine, name, self.sizes, [*at.all, *slope, *(a for a, _ in behind)])
 
         return pulled
+
+
+def _as_now(function: Callable[[], Any]) -> Callable[[], Any]:
+    """The function with the precision of now: it is called later, on another thread, where that may be another."""
+    double = jax.config.jax_enable_x64  # type: ignore[attr-defined]
+
+    def later() -> Any:
+        with _precision(double):
+            return function()
+
+    return later
+
+
+def _precision(double: bool) -> Any:
+    """`jax.enable_x64`, by the name that it has in this JAX."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(double)
+    from jax.experimental import enable_x64  # type: ignore[attr-defined]
+
+    return enable_x64(double)
 
 
 def _called(engine: Engine, name: str, sizes: Sizes, arrays: Arrays) -> Arrays:

@@ -87,7 +87,7 @@ _registered: dict[str, Any] = {}
 _lock = threading.Lock()
 
 
-def operation(name: str, function: Function, results: Sequence[jax.ShapeDtypeStruct]) -> Callable[..., list[jax.Array]]:
+def operation(name: str, function: Function, results: Sequence[jax.ShapeDtypeStruct]) -> Callable[..., Any]:
     """A function of arrays that hands their addresses, and those of the results, to ``function``.
 
     Args:

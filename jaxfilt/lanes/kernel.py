@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import hashlib
 import math
 import os
@@ -62,6 +63,11 @@ def each(work: Callable[[T], None], items: Iterable[T], threads: int | None = No
             raise error
 
 
+@functools.cache
+def _compiler() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "jaxfilt-compiler")
+
+
 def _workers() -> ThreadPoolExecutor:
     global _pool
     if _pool is None:
@@ -73,6 +79,7 @@ def _forget_workers() -> None:
     """A forked child has none of its parent's threads."""
     global _pool
     _pool = None
+    _compiler.cache_clear()
 
 
 if hasattr(os, "register_at_fork"):
@@ -102,8 +109,12 @@ class Kernel:
         self.lanes = registers * machine.vector_bytes() // sizes.most_common(1)[0][0]
         self.text = ir(program, self.lanes, _NAME)
         self.digest = hashlib.sha256(self.text.encode()).hexdigest()
-        self._code = machine.compiled(self.text, _NAME)
-        self._function = ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * 5, ctypes.c_void_p)(self._code.address)
+        # LLVM works beside XLA, which has the rest of the user's function to compile meanwhile.
+        self._code = _compiler().submit(machine.compiled, self.text, _NAME)
+
+    @functools.cached_property
+    def _function(self) -> Callable[..., None]:
+        return ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * 5, ctypes.c_void_p)(self._code.result().address)
 
     def __call__(
         self,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
@@ -62,4 +63,3 @@ _linear.def_abstract_eval(lambda *_, results, **__: [jax.core.ShapedArray(a.shap
 mlir.register_lowering(_linear, mlir.lower_fun(_forward, multiple_results=True))
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batch
-

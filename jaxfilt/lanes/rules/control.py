@@ -56,7 +56,7 @@ def _either(lowering: Lowering, index: int, first: int, found: list[list[Nodes]]
         predicate, sides = g.args[index][0], (others, found[0])
     else:
         at = g.constant(first, g.kind[index])
-        predicate, sides = g.make("le" if first == 0 else "eq", index, at), (found[first], others)
+        predicate, sides = g.make("eq", index, at), (found[first], others)
     instance = g.instance(("cond", predicate, *(tuple(nodes.ravel().tolist()) for side in sides for nodes in side)))
 
     def branch(yes: int, no: int) -> int:

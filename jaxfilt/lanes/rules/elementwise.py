@@ -164,11 +164,10 @@ def _(lowering: Lowering, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
     g = lowering.graph
 
     def pick(which: int, *cases: int) -> int:
-        """The case of this number, of numbers beyond them the nearest."""
+        """The case of this number, the last one if there is none."""
         found = cases[-1]
         for i in reversed(range(len(cases) - 1)):
-            here = g.make("le" if i == 0 else "eq", which, number(g, which, i))
-            found = lowering.pick(here, cases[i], found)
+            found = lowering.pick(g.make("eq", which, number(g, which, i)), cases[i], found)
         return found
 
     return mapped(pick, which, *cases)
