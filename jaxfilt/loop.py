@@ -20,6 +20,9 @@ Body = Callable[[PyTree, PyTree, PyTree], tuple[PyTree, tuple]]
 WORTHWHILE = 20_000
 """Rows of all runs together from which compiled lanes are worth their compilation."""
 
+LARGEST = 60_000
+"""Operations of a row beyond which "auto" leaves it to XLA: straight code of that length takes long to compile."""
+
 _RUNS = "runs"
 _log = logging.getLogger("jaxfilt")
 
@@ -73,7 +76,7 @@ def loop(
 
     def on(lanes: bool) -> tuple[PyTree, tuple]:
         if lanes:
-            return _lanes(body, arguments, runs, axes, outputs)
+            return _lanes(body, arguments, runs, axes, outputs, LARGEST if backend == "auto" else None)
         return _xla(body, arguments, runs, axes, outputs, segment)
 
     return in_lanes(on, backend, runs * _steps(rows, axes[2], runs))
@@ -235,7 +238,12 @@ def _thinned(
 
 
 def _lanes(
-    body: Body, arguments: tuple[PyTree, PyTree, PyTree], runs: int, axes: tuple, outputs: Outputs
+    body: Body,
+    arguments: tuple[PyTree, PyTree, PyTree],
+    runs: int,
+    axes: tuple,
+    outputs: Outputs,
+    largest: int | None,
 ) -> tuple[PyTree, tuple]:
     from jaxfilt.lanes.trace import Stored
     from jaxfilt.lanes.trees import over_runs
@@ -245,7 +253,7 @@ def _lanes(
         Stored(summed=True) if isinstance(how, Added) else Stored(every=how.every, few=how.runs is not None)
         for how in outputs
     ]
-    carry, found = over_runs(body, *arguments, axes, runs, stored, few)
+    carry, found = over_runs(body, *arguments, axes, runs, stored, few, largest)
 
     def first(how: Kept | Added, tree: PyTree) -> PyTree:
         return tree if isinstance(how, Added) else jax.tree.map(lambda a: a[: how.runs], tree)

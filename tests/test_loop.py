@@ -297,6 +297,19 @@ def test_what_lanes_cannot_compute_is_named_and_computed_by_xla(caplog):
     assert __file__ in caplog.records[0].message
 
 
+def test_auto_leaves_a_huge_row_to_xla(monkeypatch, caplog):
+    def body(_, x, row):
+        return x + jnp.sin(row), (x,)
+
+    monkeypatch.setattr(loops, "LARGEST", 20)
+    loops._say.cache_clear()
+    with caplog.at_level(logging.WARNING, "jaxfilt"):
+        _, (kept,) = cumulated("auto", body)
+    np.testing.assert_allclose(kept[:, -1], 99 * np.sin(1.0))
+    assert "more than the 20 that pay" in caplog.records[0].message
+    assert cumulated("lanes", body)[1][0].shape == (300, 100)
+
+
 def test_auto_leaves_small_work_to_xla(monkeypatch):
     def never(*_):
         raise AssertionError("compiled")

@@ -14,6 +14,8 @@ from jax.custom_derivatives import SymbolicZero
 
 from jaxfilt.lanes import derive, ffi, linear
 from jaxfilt.lanes.engine import Engine, Operand, Result, Single, Sizes
+from jaxfilt.lanes.health import living
+from jaxfilt.lanes.nodes import Unsupported
 from jaxfilt.lanes.program import Program
 from jaxfilt.lanes.reverse import Counts, Pair
 from jaxfilt.lanes.trace import Assumed, Stored, Traced, program, traced
@@ -34,13 +36,15 @@ class Parts(NamedTuple):
         return [*self.constants, *self.rows, *self.start]
 
 
-def compiled(row: Traced, arrays: Parts, shared: Parts, sizes: Sizes) -> tuple[Arrays, Arrays]:
+def compiled(
+    row: Traced, arrays: Parts, shared: Parts, sizes: Sizes, largest: int | None = None
+) -> tuple[Arrays, Arrays]:
     """The carry at the end, leading axis runs, and the outputs of a traced row, for arrays of all runs and rows.
 
     Raises:
-        Unsupported: an equation that has no rule.
+        Unsupported: an equation that has no rule, or a row of more operations than ``largest``.
     """
-    loop = Loop(row, shared._replace(constants=[*shared.constants, *(True for _ in row.given)]), sizes)
+    loop = Loop(row, shared._replace(constants=[*shared.constants, *(True for _ in row.given)]), sizes, largest)
     found = loop.differentiable()(*arrays._replace(constants=[*arrays.constants, *row.given]).all)
     return found[: len(arrays.start)], found[len(arrays.start) :]
 
@@ -48,8 +52,8 @@ def compiled(row: Traced, arrays: Parts, shared: Parts, sizes: Sizes) -> tuple[A
 class Loop:
     """A traced row, and how often it runs: as a function of flat arrays, in the order of `Parts`."""
 
-    def __init__(self, row: Traced, shared: Parts, sizes: Sizes) -> None:
-        self.row, self.shared, self.sizes = row, shared, sizes
+    def __init__(self, row: Traced, shared: Parts, sizes: Sizes, largest: int | None = None) -> None:
+        self.row, self.shared, self.sizes, self.largest = row, shared, sizes, largest
         own, carried, avals = row.sizes[0], row.carried(), row.closed.in_avals
         self.avals = Parts([*avals[:own], *row.given], list(avals[own + len(carried) :]), list(carried))
         self.outs = row.closed.out_avals[len(carried) :]
@@ -94,6 +98,9 @@ class Loop:
     def _program(self, strict: bool) -> tuple[Program, Assumed]:
         if strict not in self._made:
             self._made[strict] = program(self.row, self.shared, False, strict)
+            size = 0 if strict or self.largest is None else len(living(self._made[strict][0]))
+            if self.largest is not None and size > self.largest:
+                raise Unsupported("row", f"{size} operations on numbers, more than the {self.largest} that pay")
         return self._made[strict]
 
     def _name(self) -> str:
@@ -130,7 +137,7 @@ class Loop:
         counts = len(at.constants), len(at.start)
         stored = [how for a, how in zip(self.outs, self.row.stored, strict=True) if derive.is_float(a)]
         body = derive.tangents(self.row.flat, counts, chosen)
-        loop = Loop(traced(body, avals, stored), shared, self.sizes)
+        loop = Loop(traced(body, avals, stored), shared, self.sizes, self.largest)
         return loop(*arrays.all)[len(at.start) :]
 
     def _cotangents(self, active: list[bool], primals: Arrays, cotangents: Arrays) -> Arrays:

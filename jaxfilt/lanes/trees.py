@@ -26,6 +26,7 @@ def over_runs(
     runs: int,
     stored: Sequence[Stored],
     few: int | None = None,
+    largest: int | None = None,
 ) -> tuple[PyTree, list[PyTree]]:
     """`jax.lax.scan` of one run under `jax.vmap`, compiled to one loop that keeps a register of runs in flight.
 
@@ -37,12 +38,13 @@ def over_runs(
         runs: how many.
         stored: what becomes of each tree that the body returns.
         few: of how many of the first runs those outputs are that are kept of a few.
+        largest: how many operations on numbers a row may have.
 
     Returns:
         The carry, leading axis runs, and the outputs.
 
     Raises:
-        Unsupported: an equation that has no rule.
+        Unsupported: an equation that has no rule, or too many of them.
         TypeError: what is carried changes its shape or dtype.
     """
     trees = Parts(constants, rows, start)
@@ -70,7 +72,7 @@ def over_runs(
     row = row._replace(stored=tuple(how for how, n in zip(stored, counts, strict=True) for _ in range(n)))
     steps = next(a.shape[not alike] for a, alike in zip(arrays.rows, shared.rows, strict=True))
     sizes = Sizes(runs, steps, runs if few is None else min(few, runs))
-    carry, outs = compiled(row, arrays, shared, sizes)
+    carry, outs = compiled(row, arrays, shared, sizes, largest)
     ends = [0, *itertools.accumulate(counts)]
     found = [jax.tree.unflatten(form, outs[ends[k] : ends[k + 1]]) for k, (form, _) in enumerate(returned)]
     return jax.tree.unflatten(forms.start, [_wrapped(a, k) for a, k in zip(carry, keys.start, strict=True)]), found

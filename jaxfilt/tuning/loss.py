@@ -119,7 +119,9 @@ def _every(problem: Problem, data: Case, axes: Case, lanes: bool) -> Callable:
             rows, along = ((rows_of(objective, c.log, c.truth), c.weight) for c in (data, axes))
         first = jax.vmap(lambda v, b, rows: take(v, b, jax.tree.map(lambda a: a[0], rows[0]))[1], (0, 0, along))
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(first, V, beliefs, rows))
-        carry, _ = loop(body, V, (beliefs, nothing), rows, runs=len(V), axes=(0, 0, along), outputs=(), backend="lanes")
+        carry, _ = loop(
+            body, V, (beliefs, nothing), rows, runs=len(V), axes=(0, 0, along), outputs=(), backend=problem.backend
+        )
         return carry[1]
 
     return every
