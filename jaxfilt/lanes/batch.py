@@ -170,7 +170,8 @@ class Loop:
         operands = _operands(self.avals, self.shared, self.sizes)
         operands += [Operand(np.dtype(a.dtype), a.shape, False) for a in begin]
         operands += [Operand(np.dtype(a.dtype), (steps, *a.shape), how.summed) for a, how in outs]
-        counts = Counts(*(len(part) for part in self.avals), len(begin), len(sums))
+        constants, rows, start = (len(part) for part in self.avals)
+        counts = Counts(constants, rows, start, len(begin), len(sums))
 
         def pair(strict: bool) -> Pair:
             leaves = self._program(strict)[0].leaves[: len(self.avals.start)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxfilt.lanes.graph import KINDS
 from jaxfilt.lanes.kernel import Kernel
+from jaxfilt.lanes.pages import prefer_large
 from jaxfilt.lanes.program import Program
 from jaxfilt.lanes.trace import Assumed
 
@@ -70,6 +71,8 @@ class Engine:
         """Compute: from arrays at these addresses to arrays at those."""
         operands = [o.at(address, sizes.runs) for o, address in zip(self.operands, reads, strict=True)]
         results = [viewed(address, r.dtype, r.whole(sizes)) for r, address in zip(self.results, writes, strict=True)]
+        for address, a in zip(writes, results, strict=True):
+            prefer_large(address, a.nbytes)
         doubtful = self.fast(operands, results, sizes)
         if doubtful.any():
             self._again(doubtful, operands, results, sizes)
