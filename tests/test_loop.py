@@ -228,6 +228,12 @@ def test_forward_mode_and_its_batch():
     assert_same(*jacobians, 1e-11)
 
 
+def test_second_derivatives_are_refused_with_the_way_out():
+    of, values = of_floats(lambda a: loss(a, "lanes", 2), case(2))
+    with pytest.raises(NotImplementedError, match="backend='xla' has second derivatives"):
+        jax.hessian(lambda g: of([g, *values[1:]]))(values[0])
+
+
 def test_a_batch_of_gradients():
     of = {b: of_floats(lambda a, b=b: loss(a, b, 5), case(5))[0] for b in ("lanes", "xla")}
     values = of_floats(None, case(5))[1]

@@ -14,24 +14,10 @@
 #include <omp.h>
 #endif
 
-#ifndef REAL
-#define REAL double
-#endif
-#ifndef BYTES /* of a V: the widest register there is; two to a V were slower */
-#if defined(__AVX512F__)
-#define BYTES 64
-#elif defined(__AVX__)
-#define BYTES 32
-#else
-#define BYTES 16
-#endif
-#endif
+#include "vector.h"
 #define L ((int)(BYTES / sizeof(REAL)))
-#define INLINE static inline __attribute__((always_inline))
 #define UNROLL _Pragma("GCC unroll 16")
 #define ID(i, j) ((i) >= (j) ? (i) * ((i) + 1) / 2 + (j) : (j) * ((j) + 1) / 2 + (i))
-
-typedef REAL V __attribute__((vector_size(BYTES)));
 
 typedef struct {
     int steps;

@@ -4,22 +4,9 @@
 #include <cmath>
 #include <cstring>
 
-#ifndef REAL
-#define REAL double
-#endif
-#ifndef BYTES /* of a V: the widest register there is; two to a V were slower */
-#if defined(__AVX512F__)
-#define BYTES 64
-#elif defined(__AVX__)
-#define BYTES 32
-#else
-#define BYTES 16
-#endif
-#endif
+#include "vector.h"
 
 constexpr int L = BYTES / sizeof(REAL), K = 8;
-typedef REAL V __attribute__((vector_size(BYTES)));
-#define INLINE static inline __attribute__((always_inline))
 #define EACH for (int k = 0; k < K; k++)
 
 struct Dual { V v, d[K]; };

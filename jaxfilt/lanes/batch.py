@@ -14,9 +14,9 @@ from jax.custom_derivatives import SymbolicZero
 
 from jaxfilt.lanes import derive, ffi, linear
 from jaxfilt.lanes.engine import Engine, Operand, Result, Single, Sizes
-from jaxfilt.lanes.health import living
 from jaxfilt.lanes.nodes import Unsupported
 from jaxfilt.lanes.program import Program
+from jaxfilt.lanes.reach import living
 from jaxfilt.lanes.reverse import Counts, Pair
 from jaxfilt.lanes.trace import Assumed, Stored, Traced, program, traced
 
@@ -229,7 +229,9 @@ def _precision(double: bool) -> Any:
 def _called(engine: Engine, name: str, sizes: Sizes, arrays: Arrays) -> Arrays:
     shapes = [jax.ShapeDtypeStruct(r.whole(sizes), r.dtype) for r in engine.results]
     unique = hashlib.sha256(f"{name} {tuple(sizes)}".encode()).hexdigest()[:32]
-    return list(ffi.operation(unique, lambda reads, writes: engine(reads, writes, sizes), shapes)(*arrays))
+    operation = jax.custom_jvp(ffi.operation(unique, lambda reads, writes: engine(reads, writes, sizes), shapes))
+    operation.defjvp(linear.differentiated_once)
+    return list(operation(*arrays))
 
 
 def _operands(avals: Parts, shared: Parts, sizes: Sizes) -> list[Operand]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxfilt.lanes.graph import KINDS
 from jaxfilt.lanes.kernel import Kernel
 from jaxfilt.lanes.pages import prefer_large
-from jaxfilt.lanes.program import Program
+from jaxfilt.lanes.program import Leaf, Program
 from jaxfilt.lanes.trace import Assumed
 
 Arrays = list[np.ndarray]
@@ -108,6 +108,7 @@ class Single:
         self.kernel, self.leaves = Kernel(program), program.leaves
         self.sources = len(program.sources)
         self.assumed = assumed
+        self.expected = [_expected(leaf) for leaf in program.leaves]
 
     def __call__(self, operands: Arrays, results: Arrays, sizes: Sizes, threads: int | None = None) -> np.ndarray:
         sources, start = operands[: self.sources], operands[self.sources :]
@@ -127,17 +128,28 @@ class Single:
     def _unequal(self, start: Arrays, runs: int) -> np.ndarray:
         """Runs whose start is not what the program takes for granted of it."""
         doubtful = np.zeros(runs, bool)
-        for a, leaf in zip(start, self.leaves, strict=False):
-            first: dict[int, int] = {}
-            origin = [first.setdefault(slot, e) if slot >= 0 else -1 for e, slot in enumerate(leaf.slots)]
-            if origin == list(range(len(origin))):
-                continue
-            flat = a.reshape(-1, len(leaf.slots))
-            expected = flat[:, [max(o, 0) for o in origin]]
-            fixed = [o < 0 for o in origin]
-            expected[:, fixed] = np.array(leaf.constants, flat.dtype)[fixed]
-            doubtful |= (flat != expected).any(1)
+        for a, expected in zip(start, self.expected, strict=False):
+            if expected is not None:
+                flat = a.reshape(-1, len(expected.origin))
+                doubtful |= (flat != np.where(expected.fixed, expected.constants, flat[:, expected.origin])).any(1)
         return doubtful
+
+
+class Expected(NamedTuple):
+    """What a leaf is taken to start with: each element as that of its ``origin`` or, where ``fixed``, a constant."""
+
+    origin: np.ndarray
+    fixed: np.ndarray
+    constants: np.ndarray
+
+
+def _expected(leaf: Leaf) -> Expected | None:
+    """None where nothing is taken for granted."""
+    first: dict[int, int] = {}
+    origin = np.array([first.setdefault(slot, e) if slot >= 0 else -1 for e, slot in enumerate(leaf.slots)], int)
+    if (origin == np.arange(len(origin))).all():
+        return None
+    return Expected(np.maximum(origin, 0), origin < 0, np.array(leaf.constants, KINDS[leaf.kind]))
 
 
 def viewed(address: int, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from jaxfilt.lanes.graph import Graph
 from jaxfilt.lanes.program import Program
+from jaxfilt.lanes.reach import living
 
 # What these give is not finite if any of these arguments is not.
 _PASS_ON = {
@@ -44,21 +45,6 @@ def watch(program: Program) -> tuple[list[int], set[int]]:
     inputs = {graph.value[n][1]: n for n in live if graph.op[n] == "input" and graph.value[n][0] == "carry"}
     loose = {k for k, n in inputs.items() if n in covered and program.slots[k].kind[0] == "f"}
     return found, loose if found else set()
-
-
-def living(program: Program) -> set[int]:
-    """The nodes that slots and outputs need."""
-    nodes = {slot.after for slot in program.slots}
-    for output in program.outputs:
-        nodes |= set(output.nodes)
-    graph = program.graph
-    stack = list(nodes)
-    while stack:
-        for a in graph.args[stack.pop()]:
-            if a not in nodes:
-                nodes.add(a)
-                stack.append(a)
-    return nodes
 
 
 def _resolved(graph: Graph, live: set[int]) -> set[int]:

@@ -44,6 +44,11 @@ def _transpose(cotangents: Arrays, *arrays: Any, transpose: Function, fixed: int
     return [None] * fixed + transpose(residuals, whole)
 
 
+def differentiated_once(*_: Any, **__: Any) -> Any:
+    """The rule of what has no derivative of its own."""
+    raise NotImplementedError("compiled lanes are differentiated once; backend='xla' has second derivatives")
+
+
 def _batch(arrays: Any, axes: Any, **parameters: Any) -> tuple[Arrays, list[int]]:
     mapped = [k for k, axis in enumerate(axes) if axis is not None]
     moved = [jnp.moveaxis(arrays[k], axes[k], 0) for k in mapped]
@@ -62,4 +67,5 @@ _linear.def_impl(lambda *arrays, **parameters: jax.jit(lambda *a: _forward(*a, *
 _linear.def_abstract_eval(lambda *_, results, **__: [jax.core.ShapedArray(a.shape, a.dtype) for a in results])
 mlir.register_lowering(_linear, mlir.lower_fun(_forward, multiple_results=True))
 ad.primitive_transposes[_linear] = _transpose
+ad.primitive_jvps[_linear] = differentiated_once
 batching.primitive_batchers[_linear] = _batch

@@ -8,20 +8,25 @@ ONCE, BLOCK, ROW = range(3)
 """Where a node is computed: once in a call, once for a block of runs, in each row."""
 
 
+def living(program: Program) -> set[int]:
+    """The nodes that slots and outputs need."""
+    stack = [node for output in program.outputs for node in output.nodes]
+    stack += [slot.after for slot in program.slots]
+    needed: set[int] = set()
+    while stack:
+        node = stack.pop()
+        if node not in needed:
+            needed.add(node)
+            stack.extend(program.graph.args[node])
+    return needed
+
+
 class Reach:
     """``live``: the nodes that are needed, in an order in which they can be computed."""
 
     def __init__(self, program: Program) -> None:
         graph = self._graph = program.graph
-        roots = [node for output in program.outputs for node in output.nodes]
-        stack = roots + [slot.after for slot in program.slots]
-        needed: set[int] = set()
-        while stack:
-            node = stack.pop()
-            if node not in needed:
-                needed.add(node)
-                stack.extend(graph.args[node])
-        self.live = sorted(needed)  # a node is made after its arguments
+        self.live = sorted(living(program))  # a node is made after its arguments
         self._moving: set[int] = set()
         self._shared: set[int] = set()
         self._elements: dict[int, dict[int, int]] = {}
