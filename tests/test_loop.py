@@ -10,6 +10,8 @@ import pytest
 import jaxfilt as jf
 from jaxfilt import loop as loops
 from jaxfilt.lanes import Unsupported
+from jaxfilt.lanes.batch import Parts
+from jaxfilt.lanes.trace import Stored, program, traced
 from jaxfilt.loop import Added, Kept, loop
 from jaxfilt.scenarios import scenario
 
@@ -139,6 +141,35 @@ def test_zero_times_what_is_not_finite_is_not_zero():
     ours, theirs = both(body, ((), jnp.ones(5), rows), runs=5, axes=(None, 0, 0), outputs=[Kept()])
     assert np.isnan(theirs[1][0][2, 1, 0])
     assert_same(ours, theirs, 0)
+
+
+def test_zero_times_what_is_not_finite_in_the_very_last_row():
+    """What would be seen only in the row after it, had there been one."""
+
+    def body(_, carry, row):
+        before, total = carry
+        product, nothing = jax.jvp(lambda x: row * row * x, (jnp.ones(()),), (jnp.zeros(()),))
+        return (product, total + before), (nothing,)
+
+    rows = jnp.ones((5, 4)).at[2, 3].set(jnp.inf)
+    start = (jnp.ones(5), jnp.zeros(5))
+    ours, theirs = both(body, ((), start, rows), runs=5, axes=(None, 0, 0), outputs=[Kept()])
+    assert np.isnan(theirs[1][0][2, 3])
+    assert_same(ours, theirs, 0)
+
+
+def test_equal_and_constant_numbers_of_the_carry_are_found():
+    def body(constants, carry, row):
+        (P, c), (F,) = carry, row
+        P = F @ P @ F.T
+        return [jnp.tril(P) + jnp.tril(P, -1).T, jnp.full_like(c, 2.0)], [P[0]]
+
+    matrix, number = jax.ShapeDtypeStruct((3, 3), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
+    avals, shared = Parts([], [matrix], [matrix, number]), Parts([], [False], [False, False])
+    made = [program(traced(body, avals, [Stored()]), shared, False, strict)[0] for strict in (False, True)]
+    assert [made[0].leaves[k].slots for k in (0, 1)] == [(0, 1, 2, 1, 3, 4, 2, 4, 5), (-1,)]
+    assert made[0].leaves[1].constants == (2.0,)
+    assert [made[1].leaves[k].slots for k in (0, 1)] == [tuple(range(9)), (9,)]
 
 
 def test_a_start_that_is_not_symmetric_is_not_taken_for_it():
