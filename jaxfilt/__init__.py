@@ -28,6 +28,7 @@ from jaxfilt.noise import (
     white,
 )
 from jaxfilt.objectives import held_back, likelihood, log_score, mix, mse, nees_match, nis_match
+from jaxfilt.out_of_sequence import OutOfSequence, out_of_sequence
 from jaxfilt.report.arrays import to_xarray
 from jaxfilt.review import Replayed, Review, replayed
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
@@ -72,6 +73,7 @@ __all__ = [
     "Model",
     "Moments",
     "Objective",
+    "OutOfSequence",
     "Paired",
     "Parametrisation",
     "Recording",
@@ -130,6 +132,7 @@ __all__ = [
     "nees_match",
     "nis_match",
     "norm",
+    "out_of_sequence",
     "priors",
     "product",
     "range_bearing",

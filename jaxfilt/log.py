@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ def merge(
     streams: Mapping[str, Stream | tuple[Any, ...]],
     u: tuple[np.ndarray, PyTree] | None = None,
     start: float | None = None,
+    late: Mapping[str, float] | None = None,
 ) -> Recording:
     """One log from recorded streams: rows in order of time, whatever the order of arrival.
 
@@ -33,12 +35,14 @@ def merge(
         streams: sensor -> Stream(t, z, c, valid), or the tuple (t, z[, c[, valid]]). t in s, any order.
         u: (t, values): the input at increasing stamps, values a pytree with leading axis K.
         start: time of the initial belief, s; default the first stamp, whose row then has dt = 0 (update-first).
+        late: sensor -> s by which its stamps come after the instant that its readings speak of (negative: before). They
+            are taken back by it, and ordered by the time of their validity.
 
     Returns:
         Recording(log, t): numbers in JAX's default float dtype, t absolute in float64.
 
     Raises:
-        KeyError: a sensor that the model lacks.
+        KeyError: a sensor that the model lacks, a late one without a stream.
         ValueError: NaN in t, z or u (mark what is missing by ``valid``), lengths that differ, input stamps out of
             order, nothing to merge, a stamp before ``start``.
 
@@ -49,7 +53,8 @@ def merge(
         >>> rec.t.tolist(), rec.log.dt.tolist(), rec.log.z["z"][:, 0].tolist()
         ([0.0, 0.5], [0.0, 0.5], [1.0, 2.0])
     """
-    named = {name: _sorted(_checked(model, name, stream)) for name, stream in streams.items()}
+    delays = _delays(late, streams)
+    named = {name: _sorted(_checked(model, name, stream, delays.get(name, 0.0))) for name, stream in streams.items()}
     tu, values = _checked_input(u)
     t, rows = _rows({name: stream.t for name, stream in named.items()}, tu)
     if not len(t):
@@ -74,7 +79,17 @@ def merge(
     return Recording(_in_default_dtype(log), t)
 
 
-def _checked(model: Model, name: str, stream: tuple[Any, ...]) -> Stream:
+def _delays(late: Mapping[str, float] | None, streams: Mapping[str, Any]) -> dict[str, float]:
+    delays = dict(late or {})
+    for name, delay in delays.items():
+        if name not in streams:
+            raise KeyError(f"late: expected sensors of {list(streams)}, got {name!r}")
+        if isinstance(delay, bool) or not isinstance(delay, Real) or not math.isfinite(delay):
+            raise ValueError(f"late[{name!r}]: expected a finite number of seconds, got {delay!r}")
+    return {name: float(delay) for name, delay in delays.items()}
+
+
+def _checked(model: Model, name: str, stream: tuple[Any, ...], late: float) -> Stream:
     space = doors.sensor(model, name).space
     if not (isinstance(stream, tuple) and 2 <= len(stream) <= 4):
         raise TypeError(
@@ -94,7 +109,7 @@ def _checked(model: Model, name: str, stream: tuple[Any, ...]) -> Stream:
         raise ValueError(f"{bad}; put any finite number there and mark it in valid") from None
     doors.leading(f"c of {name!r}", c, len(t))
     doors.finite(f"c of {name!r}", c)
-    return Stream(t, z, c, valid)
+    return Stream(t - late, z, c, valid)
 
 
 def _seconds(name: str, t: Any) -> np.ndarray:

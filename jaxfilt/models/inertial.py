@@ -8,15 +8,20 @@ sensors of a few grams. Parameters ``theta`` are natural logarithms of noise den
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxfilt import doors
 from jaxfilt.models.control import GRAVITY
 from jaxfilt.spaces import product, rotate, so3, vector
 from jaxfilt.types import Array, Model, PyTree, Sensor, Space
+
+DENSITIES = ("gyro", "accelerometer", "gyro_walk", "accelerometer_walk")
+"""What `inertial` reads of theta."""
 
 
 class Navigation(NamedTuple):
@@ -33,7 +38,8 @@ class Navigation(NamedTuple):
     accelerometer_bias: Array
     """(3,) m/s^2, body."""
     extra: PyTree = ()
-    """What else wanders, name -> point: a barometer's drift, a beacon's bias, a lever arm; see `Wander`."""
+    """What else wanders, name -> point: a barometer's drift, a beacon's bias, a lever arm; see `Wander`. Of a model
+    that remembers, ``extra["imu"]`` is the last `Imu`."""
 
 
 class Imu(NamedTuple):
@@ -84,11 +90,18 @@ BMI088 = data_sheet(math.radians(0.014), 175 * 9.80665e-6, 2e-5, 1e-3)
 """A MEMS IMU of small flight controllers; white noise by its data sheet, bias walks chosen."""
 
 
-def navigation_space(extra: Mapping[str, Wander] | None = None) -> Space:
+MEMORY = Space(
+    0, lambda u, d: u, lambda a, b: jnp.zeros(0, a.gyro.dtype), Imu(gyro=np.zeros(3), accelerometer=np.zeros(3)), True
+)
+"""Where a remembered `Imu` lives: of no dimension, for what was read is known."""
+
+
+def navigation_space(extra: Mapping[str, Wander] | None = None, remember: bool = False) -> Space:
     """The space of a `Navigation` with these extra states: 15 dimensions (position, velocity, attitude about the body
-    axes, gyroscope bias, accelerometer bias), then the extra states in the order of their sorted names."""
-    more: Any = {name: wander.space for name, wander in extra.items()} if extra else ()
-    return product(Navigation(vector(3), vector(3), so3, vector(3), vector(3), more))
+    axes, gyroscope bias, accelerometer bias), then the extra states in the order of their sorted names; and, to
+    remember, a ``extra["imu"]`` of no dimension."""
+    more: Any = {name: wander.space for name, wander in (extra or {}).items()} | ({"imu": MEMORY} if remember else {})
+    return product(Navigation(vector(3), vector(3), so3, vector(3), vector(3), more or ()))
 
 
 def strapdown(x: Navigation, u: Imu, dt: Array, gravity: float = GRAVITY) -> Navigation:
@@ -125,6 +138,7 @@ def inertial(
     sensors: Mapping[str, Sensor],
     extra: Mapping[str, Wander] | None = None,
     gravity: float = GRAVITY,
+    remember: bool = False,
 ) -> Model:
     """Inertial navigation: `strapdown` with the noise of the IMU's data sheet, biases that walk, and your sensors.
 
@@ -138,9 +152,16 @@ def inertial(
         sensors: name -> sensor of a `Navigation`, see `jaxfilt.models.sensors`.
         extra: name -> `Wander`, more states, found as ``x.extra[name]``.
         gravity: m/s^2 at the place.
+        remember: whether the state keeps the last reading, as ``x.extra["imu"]``, for sensors that need it (optical
+            flow, a velocity with a lever arm, a late one); it adds no dimension. Otherwise give it as their context.
 
     Returns:
         A model on `Navigation` (15 dimensions and those of extra) with input `Imu`.
+
+    Raises:
+        KeyError: a parameter that is missing in theta. ValueError: one that is neither a number nor (3,), an extra
+            space that is not flat, an extra state called "imu" beside the remembered one.
+        TypeError: what is no `Wander` in extra, or no `Sensor` in sensors.
 
     Example: a drone with GNSS.
         >>> import jax.numpy as jnp, jaxfilt as jf
@@ -150,12 +171,12 @@ def inertial(
         15
     """
     more = dict(sorted(extra.items())) if extra else {}
+    _check(theta, sensors, more, remember)
 
     def f(x: Navigation, u: Imu, dt: Array) -> Navigation:
         y = strapdown(x, u, dt, gravity)
-        if not more:
-            return y
-        return y._replace(extra={name: _faded(wander, x.extra[name], dt) for name, wander in more.items()})
+        kept: dict[str, PyTree] = {name: _faded(wander, x.extra[name], dt) for name, wander in more.items()}
+        return y._replace(extra=kept | ({"imu": u} if remember else {}) or ())
 
     def Q(x: Navigation, u: Imu, dt: Array) -> Array:
         own = strapdown_noise(theta, x, u, dt)
@@ -163,7 +184,7 @@ def inertial(
             return own
         return jax.scipy.linalg.block_diag(own, *[jnp.diag(_spread(wander, dt)) for wander in more.values()])
 
-    return Model(f, Q, navigation_space(more), dict(sensors))
+    return Model(f, Q, navigation_space(more, remember), dict(sensors))
 
 
 def strapdown_noise(theta: PyTree, x: Navigation, u: Imu, dt: Array) -> jax.Array:
@@ -182,16 +203,13 @@ def strapdown_noise(theta: PyTree, x: Navigation, u: Imu, dt: Array) -> jax.Arra
     Source: J. Sola, Quaternion kinematics for the error-state Kalman filter, arXiv:1711.02508 (2017), eqs. 236 to 238
     (the error dynamics), integrated here.
     """
-    g, a, wg, wa = (
-        jnp.exp(2 * jnp.broadcast_to(jnp.asarray(theta[name]), (3,)))
-        for name in ("gyro", "accelerometer", "gyro_walk", "accelerometer_walk")
-    )
+    g, a, wg, wa = (jnp.exp(2 * jnp.broadcast_to(jnp.asarray(theta[name]), (1, 3))) for name in DENSITIES)
     R = jnp.stack([rotate(x.att, axis) for axis in jnp.eye(3, dtype=x.att.dtype)], axis=1)
     force = u.accelerometer - x.accelerometer_bias
     S = jnp.stack([jnp.cross(row, force) for row in R])  # R [f]x, row by row: r' [f]x = (r x f)'
     B, V, U = S * g, S * wg, R * wa
     A, RA, W, RW = B @ S.T, (R * a) @ R.T, V @ S.T, U @ R.T
-    G, Wg, Wa, none = jnp.diag(g), jnp.diag(wg), jnp.diag(wa), jnp.zeros_like(R)
+    G, Wg, Wa, none = jnp.diag(g[0]), jnp.diag(wg[0]), jnp.diag(wa[0]), jnp.zeros_like(R)
     pp = dt**3 / 3 * RA + dt**5 / 20 * (A + RW) + dt**7 / 252 * W
     pv = dt**2 / 2 * RA + dt**4 / 8 * (A + RW) + dt**6 / 72 * W
     vv = dt * RA + dt**3 / 3 * (A + RW) + dt**5 / 20 * W
@@ -207,6 +225,64 @@ def strapdown_noise(theta: PyTree, x: Navigation, u: Imu, dt: Array) -> jax.Arra
             [pa.T, va.T, none, none, dt * Wa],
         ]
     )
+
+
+def remembered(x: Navigation, c: PyTree) -> tuple[Imu, PyTree]:
+    """For `late`: the IMU's reading in the state of a model that remembers, and the whole context."""
+    return x.extra["imu"], c
+
+
+def late(
+    sensor: Sensor,
+    seconds: Array | float,
+    gravity: float = GRAVITY,
+    imu: Callable[[Navigation, PyTree], tuple[Imu, PyTree]] = lambda x, c: c,
+) -> Sensor:
+    """A sensor whose stamps come ``seconds`` after what they tell of: ``h(strapdown(x, imu, -seconds), c)``.
+
+    Differentiable in seconds, so that an offset can be tuned; a known one is better taken off the stamps, by
+    `jaxfilt.merge`. The last reading is held over those seconds, and their noise is left out: for offsets that are
+    short beside the vehicle's manoeuvres.
+
+    Args:
+        sensor: as it would read in time.
+        seconds: () s, positive where the stamps are late, negative where they are early.
+        gravity: m/s^2 at the place.
+        imu: (x, c) -> (`Imu` held over the row, context of ``sensor``). Default: the context of the late sensor is that
+            pair; `remembered` for a model that remembers.
+
+    Example: GNSS that tells of where the drone was 0.1 s ago.
+        >>> import jax.numpy as jnp
+        >>> from jaxfilt.models.sensors import GNSS_CONSUMER, gnss_position
+        >>> slow = late(gnss_position(GNSS_CONSUMER.R()), 0.1)
+        >>> level, still = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3)
+        >>> x = Navigation(still, jnp.array([10.0, 0.0, 0.0]), level, still, still)
+        >>> slow.h(x, (Imu(still, jnp.array([0.0, 0.0, 9.81])), ())).tolist()
+        [-1.0, 0.0, 0.0]
+    """
+
+    def then(x: Navigation, c: PyTree) -> tuple[Navigation, PyTree]:
+        u, inner = imu(x, c)
+        return strapdown(x, u, -seconds, gravity), inner
+
+    return Sensor(lambda x, c: sensor.h(*then(x, c)), lambda x, c: sensor.R(*then(x, c)), sensor.space)
+
+
+def _check(theta: PyTree, sensors: Mapping[str, Sensor], extra: Mapping[str, Wander], remember: bool) -> None:
+    for name in DENSITIES:
+        if not (isinstance(theta, Mapping) and name in theta):
+            given = ", ".join(theta) if isinstance(theta, Mapping) else type(theta).__name__
+            raise KeyError(f"theta: expected logarithms named {', '.join(DENSITIES)}, got {given}")
+        if np.shape(theta[name]) not in ((), (3,)):
+            raise ValueError(f"theta[{name!r}]: expected a number or shape (3,), got shape {np.shape(theta[name])}")
+    for name, sensor in sensors.items():
+        doors.instance(f"sensors[{name!r}]", sensor, Sensor)
+    for name, wander in extra.items():
+        doors.instance(f"extra[{name!r}]", wander, Wander)
+        if not wander.space.flat:
+            raise ValueError(f"extra[{name!r}].space: expected a flat space, got a curved one")
+    if remember and "imu" in extra:
+        raise ValueError("extra['imu']: expected another name, for the model remembers the IMU's reading by this one")
 
 
 def _faded(wander: Wander, b: PyTree, dt: Array) -> PyTree:
