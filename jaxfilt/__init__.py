@@ -4,6 +4,7 @@ from jaxfilt import priors
 from jaxfilt.bootstrap import block_bootstrap
 from jaxfilt.bound import Bound, cramer_rao, efficiency
 from jaxfilt.check import Checkup, check
+from jaxfilt.complementary import complementary, dead_reckoning
 from jaxfilt.diagnose import Diagnosis, diagnose
 from jaxfilt.elementary import bearing, cosc, norm, sinc, wrap
 from jaxfilt.files import load, save
@@ -102,10 +103,12 @@ __all__ = [
     "build",
     "check",
     "ckf",
+    "complementary",
     "const",
     "cosc",
     "cramer_rao",
     "cubature",
+    "dead_reckoning",
     "diagnose",
     "diagonal",
     "efficiency",

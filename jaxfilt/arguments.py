@@ -136,17 +136,20 @@ def set_dtype(dtype: str) -> None:
 
 
 def gate(gate: str, recording: str) -> float | None:
-    if not gate:
-        return recordings.GATES.get(recording)
-    if gate == "none":
+    return probability("gate", gate) if gate else recordings.GATES.get(recording)
+
+
+def probability(option: str, text: str) -> float | None:
+    """A probability, or None for ``none``."""
+    if text == "none":
         return None
     try:
-        probability = float(gate)
+        value = float(text)
     except ValueError:
-        probability = np.nan
-    if not 0 < probability < 1:
-        raise Mistake(f"--gate: expected a probability between 0 and 1, or none, got {gate!r}")
-    return probability
+        value = np.nan
+    if not 0 < value < 1:
+        raise Mistake(f"--{option}: expected a probability between 0 and 1, or none, got {text!r}")
+    return value
 
 
 def writable(out: str) -> Path:

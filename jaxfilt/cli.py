@@ -189,6 +189,9 @@ def replay(
         str,
         typer.Option(help="Probability with which a true reading passes, or none; default the recording's own."),
     ] = "",
+    robust: Annotated[
+        str, typer.Option(help="Probability with which a true reading counts in full: Huber's weight beyond it.")
+    ] = "none",
     theta: Annotated[str, typer.Option(help="theta.json of jaxfilt tune: the parameters to use.")] = "",
     dtype: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
     out: Annotated[str, typer.Option(help="Folder for the results; default jaxfilt-out/replay-NAME.")] = "",
@@ -199,14 +202,16 @@ def replay(
         terminal.listing({name: ", ".join(datasets.sequences(name)) for name in recordings.names()}, "recordings")
         return
     makers, threshold = asked.makers(filters), asked.gate(gate, recording)
+    limit = asked.probability("robust", robust)
     asked.set_dtype(dtype)
     chosen, source, label = asked.replay(recording, log, sequence)
     assumed = asked.theta(theta, chosen.theta)
     folder = asked.writable(out or f"jaxfilt-out/replay-{label}")
-    bank = {name: functools.partial(built, make, chosen.model, threshold) for name, make in makers.items()}
+    bank = {name: functools.partial(built, make, chosen.model, threshold, limit) for name, make in makers.items()}
     with explained(source), terminal.progress_bar():
         result = replayed(chosen, bank, theta=assumed)
     gated = "no gate" if threshold is None else f"gate {threshold:g}"
+    gated += "" if limit is None else f", robust {limit:g}"
     terminal.show_replay(result, f"{label}: {len(result.t):,} rows, {dtype}, {gated}", threshold is not None)
     finish(result, folder, label)
 

@@ -48,6 +48,7 @@ def tune(
         str,
         typer.Option(help="Of a recording, as in replay; none by default for likelihood and nis, which it would fool."),
     ] = "",
+    robust: Annotated[str, typer.Option(help="As in replay, of a recording or a simulation.")] = "none",
     frozen: Annotated[
         str, typer.Option(help="Names of parameters that stay as they are, or what they begin with.")
     ] = "",
@@ -77,7 +78,7 @@ def tune(
     asked.one_of("backend", backend, get_args(Backend))
     if not 0 < wrong < float("inf"):
         raise Mistake(f"--from: expected a factor above 0, got {wrong:g}")
-    limits = asked.clip(clip)
+    limits, limit = asked.clip(clip), asked.probability("robust", robust)
     asked.set_dtype(dtype)
     source, label, threshold, title = None, target, None, target
     if target in recordings.names():
@@ -99,7 +100,7 @@ def tune(
         for name, why in stay.items():
             if why:
                 print(f"frozen: {name} ({why})")
-        robot = functools.partial(built, make, job.model, threshold)
+        robot = functools.partial(built, make, job.model, threshold, limit)
         options: dict[str, Any] = {
             "objective": tuning_data.objective(objective, job, robot, burn_in),
             "frozen": tuple(stay),

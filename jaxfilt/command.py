@@ -43,9 +43,15 @@ def kept(error: OSError) -> str:
     return f"{error.filename}: {error.strerror}" if error.filename else asked.line(error)
 
 
-def built(make: Callable[..., Filter], model: Callable[[PyTree], Model], gate: float | None, theta: PyTree) -> Filter:
+def built(
+    make: Callable[..., Filter],
+    model: Callable[[PyTree], Model],
+    gate: float | None,
+    robust: float | None,
+    theta: PyTree,
+) -> Filter:
     """A filter of these parameters."""
-    return make(model(theta), gate=gate)
+    return make(model(theta), gate=gate, robust=robust)
 
 
 def finish(result: Study | Sweep | Replayed | Fit, folder: Path, label: str, bound: Bound | None = None) -> None:

@@ -75,7 +75,8 @@ def diagnose(track: Track) -> Diagnosis | None:
         what = f"sensor {sensor!r}: {CAUSES[status]}"
     elif Status.BAD_BELIEF in statuses.values() or not np.isfinite(batch.belief.cov[run, step]).all():
         sensor, status = None, Status.BAD_BELIEF
-        what = "prediction: f(x, u, dt) or Q(x, u, dt) returned NaN or inf, or the initial belief was not finite"
+        what = "prediction: f(x, u, dt) or Q(x, u, dt) returned NaN or inf"
+        what += f" from {_mean(batch, run, step - 1)}" if step else ", or the initial belief was not finite"
     else:
         sensor, status = None, Status.BAD_POSTERIOR
         what = "the covariance lost positive definiteness; use float64, or no negative centre weight"
@@ -83,6 +84,17 @@ def diagnose(track: Track) -> Diagnosis | None:
     place = f"step {step}" if single else f"run {run}, step {step}"
     others = "" if runs == 1 else f" ({runs} of {len(fault)} runs have a fault)"
     return Diagnosis(None if single else run, step, sensor, status, runs, f"{place}, {what}{others}")
+
+
+def _mean(batch: Track, run: int, step: int) -> str:
+    """The mean there, in words: "the mean pos = [0, 1.5], yaw = 0.1"."""
+    leaves = jax.tree.leaves_with_path(batch.belief.mean)
+    words = []
+    for path, leaf in leaves:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        value = np.array2string(leaf[run, step], precision=3, separator=", ", suppress_small=True, threshold=12)
+        words.append(f"{name} = {value}" if name else value)
+    return f"the mean {', '.join(words)}"
 
 
 def _faulty_beliefs(batch: Track) -> np.ndarray:

@@ -4,7 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jaxfilt.models import altitude, car, ctrv, falling, growth, lti, multirotor, textbook, tracking, wheeled
+from jaxfilt.models import (
+    altitude,
+    attitude,
+    car,
+    ctrv,
+    falling,
+    growth,
+    inertial_flight,
+    landing,
+    loop,
+    lti,
+    multirotor,
+    textbook,
+    tracking,
+    wheeled,
+)
 from jaxfilt.types import Scenario
 
 SCENARIOS: dict[str, Callable[[], Scenario]] = {
@@ -18,6 +33,11 @@ SCENARIOS: dict[str, Callable[[], Scenario]] = {
     "multirotor-harsh": multirotor.harsh_scenario,
     "multirotor-euler": multirotor.euler_scenario,
     "hexarotor": multirotor.hexarotor_scenario,
+    "multirotor-loop": loop.loop_scenario,
+    "attitude": attitude.scenario,
+    "inertial": inertial_flight.inertial_scenario,
+    "inertial-gnss": inertial_flight.inertial_gnss_scenario,
+    "landing": landing.landing_scenario,
     "vertical-drone": altitude.vertical_drone_scenario,
     "table-drone": altitude.table_drone_scenario,
     "level-drone": altitude.level_drone_scenario,

@@ -17,6 +17,9 @@ from tests.lowering import evaluated, lowered
 LARGEST = 100_000
 """Operations of a row: more would not be compiled in a reasonable time."""
 
+TOO_LARGE = {"inertial"}
+"""20 states and seven sensors in one row: left to XLA by "auto"."""
+
 
 def _row(name: str, build: Callable) -> tuple[Callable, list[np.ndarray]]:
     """A row as a function of flat arrays: simulate, filter, score; and its arguments, one lane."""
@@ -55,7 +58,8 @@ def test_every_scenario_lowers(name: str) -> None:
     graph, nodes = lowered(function, *args, strict=False)
     operations = size(graph, [int(node) for a in nodes for node in a.ravel()])
     print(f"{name}: {operations} operations")
-    assert 0 < operations < LARGEST
+    assert operations > 0
+    assert (operations > LARGEST) == (name in TOO_LARGE)
 
 
 @pytest.mark.parametrize(

@@ -330,3 +330,25 @@ def test_align_masks_gaps_but_not_their_ends():
     assert jf.align(t, (stamps, stamps), jf.scalar, gap=1.5).mask.tolist() == [True, True, False, False, True, True]
     assert jf.align(t, (stamps, stamps), jf.scalar).mask.all()
     np.testing.assert_allclose(jf.align(t, (stamps, 2 * stamps), jf.scalar).x, 2 * t)
+
+
+def test_late_stamps_are_taken_back_to_the_time_of_their_validity():
+    streams, u = recorded()
+    moved = streams | {"fix": streams["fix"]._replace(t=streams["fix"].t + 0.625)}
+    taken_back = jf.merge(CART, moved, u=u, late={"fix": 0.625})
+    in_order = jf.merge(CART, streams, u=u)
+    jax.tree.map(np.testing.assert_array_equal, taken_back, in_order)
+    assert not np.array_equal(jf.merge(CART, moved, u=u).t, in_order.t)
+
+
+@pytest.mark.parametrize(
+    ("late", "error", "words"),
+    [
+        ({"sonar": 0.1}, KeyError, "late: expected sensors of"),
+        ({"fix": math.nan}, ValueError, r"late\['fix'\]: expected a finite number of seconds, got nan"),
+        ({"fix": "0.1"}, ValueError, r"late\['fix'\]: expected a finite number"),
+    ],
+)
+def test_a_delay_is_a_number_of_seconds_of_a_sensor(late, error, words):
+    with pytest.raises(error, match=words):
+        jf.merge(CART, recorded()[0], late=late)

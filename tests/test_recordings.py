@@ -360,8 +360,8 @@ def test_errors_and_their_rmse_are_those_of_plain_numpy():
 
 
 def test_what_is_not_there_is_named():
-    with pytest.raises(KeyError, match=r"recording: expected one of .*'dart_car'.* got 'broad'"):
-        recordings.replay("broad")
+    with pytest.raises(KeyError, match=r"recording: expected one of .*'dart_car'.* got 'moon_rover'"):
+        recordings.replay("moon_rover")
     with pytest.raises(KeyError, match="sequence of 'wifibot'"):
         recordings.replay("wifibot", "3")
     blind = replayed("udacity_ctrv", "synthetic")._replace(truth=None)

@@ -100,8 +100,9 @@ def uwb_labyrinth(folder: Path, sequence: str) -> Contents:
     """Labyrinth: a robot on two wheels with one range at a time to one of four UWB modules, 30 s; sequence "indoor".
 
     Streams: ``range`` m, c = the module's place (2,), m; standard deviation as stated by the authors 0.1 m.
-    Inputs: ``wheels`` (right, left) m/s, 8 Hz. Truth: ``pos`` (2,) m, origin not stated.
-    Constants: ``track_width`` m, the distance between the wheels.
+    Inputs: ``wheels`` (right, left) m/s, 8 Hz, as the file names them; in the world of the modules' places and of the
+    truth "right" is the left one. Truth: ``pos`` (2,) m, origin not stated.
+    Constants: ``track_width`` m, as the file has it: half the distance between the wheels.
     """
     ranges = tagged_rows(folder / "Indoor_UWB_Input.txt", "range2")
     odometry = tagged_rows(folder / "Indoor_UWB_Input.txt", "odom2diff")

@@ -109,11 +109,17 @@ def multirotor_rate(x: RigidBody, wrench: Array, mass: Array, inertia: Array, dr
     )
 
 
+SINGULAR = math.cos(math.radians(85))
+"""Least cosine of the pitch at which Euler angles are flown: a loop at 100 Hz cannot leap over what is left out."""
+
+
 def euler_rate(x: EulerBody, wrench: Array, mass: Array, inertia: Array, drag: Array) -> EulerBody:
     """`multirotor_rate` with Euler angles: ``[roll pitch yaw]_dot = W [p q r]``.
 
     ``W = [[1, s_roll t_pitch, c_roll t_pitch], [0, c_roll, -s_roll], [0, s_roll / c_pitch, c_roll / c_pitch]]``,
-    which is singular at a pitch of +-90 deg: fly with `multirotor_rate` what may come near it.
+    which is singular at a pitch of +-90 deg: fly with `multirotor_rate` what may come near it. Where the cosine of the
+    pitch is less than `SINGULAR`, and beyond, the angles' rates are NaN: an estimate that got there has lost its
+    meaning, and a filter's status and `jaxfilt.diagnose` say where, in place of angles that look like any others.
 
     Args:
         x: the state.
@@ -124,7 +130,9 @@ def euler_rate(x: EulerBody, wrench: Array, mass: Array, inertia: Array, drag: A
     (sr, sp, _), (cr, cp, _) = jnp.sin(x.rpy), jnp.cos(x.rpy)
     p, q, r = x.rates
     turning = sr * q + cr * r
-    rpy = jnp.stack([p + turning * sp / cp, cr * q - sr * r, turning / cp])
+    proper = cp > SINGULAR
+    cp = jnp.where(proper, cp, 1.0)
+    rpy = jnp.where(proper, jnp.stack([p + turning * sp / cp, cr * q - sr * r, turning / cp]), jnp.nan)
     acc = _accelerated(x.vel, body_to_world(x.rpy)[:, 2], wrench[0], mass, drag)
     return EulerBody(x.vel, acc, rpy, _turn(x.rates, wrench[1:], inertia))
 

@@ -16,9 +16,16 @@ import numpy as np
 from jaxfilt import datasets, metrics
 from jaxfilt.datasets import Dataset
 from jaxfilt.log import stack
+from jaxfilt.recordings.anchored import rcv_uwb_drone
+from jaxfilt.recordings.attitude import broad
 from jaxfilt.recordings.bicycle import udacity_ctrv
 from jaxfilt.recordings.campus import nclt_1hz
+from jaxfilt.recordings.canyon import smartloc_berlin
+from jaxfilt.recordings.euroc import euroc_mav
 from jaxfilt.recordings.indoor import crazyflie_uwb
+from jaxfilt.recordings.phantom import ansfl_phantom4
+from jaxfilt.recordings.ranging import plaza_range, uwb_labyrinth
+from jaxfilt.recordings.roads import comma2k19, kitti_imu_gps
 from jaxfilt.recordings.wheels import dart_car, utias_mrclam, wifibot
 from jaxfilt.types import Gaussian, Log, PyTree, Replay
 
@@ -29,6 +36,15 @@ _REPLAYS: dict[str, Callable[[Dataset], Replay]] = {
     "wifibot": wifibot,
     "dart_car": dart_car,
     "crazyflie_uwb": crazyflie_uwb,
+    "euroc_mav": euroc_mav,
+    "ansfl_phantom4": ansfl_phantom4,
+    "broad": broad,
+    "rcv_uwb_drone": rcv_uwb_drone,
+    "plaza_range": plaza_range,
+    "uwb_labyrinth": uwb_labyrinth,
+    "kitti_imu_gps": kitti_imu_gps,
+    "comma2k19": comma2k19,
+    "smartloc_berlin": smartloc_berlin,
 }
 
 GATES: dict[str, float | None] = {
@@ -38,6 +54,15 @@ GATES: dict[str, float | None] = {
     "wifibot": None,
     "dart_car": None,
     "crazyflie_uwb": 0.999,  # ranges off by metres, up to a tenth of those to anchor 8
+    "euroc_mav": 0.9999,
+    "ansfl_phantom4": 0.9999,
+    "broad": None,
+    "rcv_uwb_drone": 0.999,  # ranges off by up to tens of metres
+    "plaza_range": None,
+    "uwb_labyrinth": 0.999,
+    "kitti_imu_gps": None,
+    "comma2k19": None,
+    "smartloc_berlin": None,  # most readings are off: a gate that refused them would lose its way
 }
 """Recording -> the ``gate`` of the filter that goes with its model's parameters."""
 
@@ -47,7 +72,7 @@ def names() -> tuple[str, ...]:
 
     Example:
         >>> import jaxfilt.recordings
-        >>> jaxfilt.recordings.names()
+        >>> jaxfilt.recordings.names()[:6]
         ('udacity_ctrv', 'utias_mrclam', 'nclt_1hz', 'wifibot', 'dart_car', 'crazyflie_uwb')
     """
     return tuple(_REPLAYS)
