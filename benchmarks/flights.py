@@ -25,9 +25,6 @@ GATE = 0.9999
 CONVERGED = {"MH_01_easy": 45.0, "V1_02_medium": 20.0, "V2_03_difficult": 20.0}
 """s from the first row on that are not scored: MH_01 is shaken, lies still, takes off after 42 s; V1_02 after 5 s."""
 
-CHOSEN_ON = ("Horizontal_path_01", "Horizontal_path_02", "Horizontal_path_03", "Horizontal_path_05")
-"""Flights of the Phantom on which its parameters were chosen."""
-
 SETTLED = 5.0
 """s of a Phantom flight that are not scored: it starts in the air."""
 
@@ -95,14 +92,12 @@ def phantoms() -> None:
         biases.append(mean.gyro_bias[len(replay.recording.t) - 1])
     for k, sequence in enumerate(sequences):
         print(f"| {sequence} | {degrees(mean_of(scores[4 * k : 4 * k + 4]))} |")
-    chosen = np.array([s in CHOSEN_ON for s in sequences for _ in IMUS])
-    for label, which in {"chosen on": chosen, "held out": ~chosen}.items():
-        print(f"| {label} | {degrees(mean_of([s for s, w in zip(scores, which, strict=True) if w]))} |")
+    print(f"| all | {degrees(mean_of(scores))} |")
     spread = np.stack(biases).reshape(len(sequences), len(IMUS), 3)
     print(f"\nGyroscope biases at the end, of an IMU over its {len(sequences)} flights: standard deviation ", end="")
     means_of = np.degrees(abs(spread.mean(0)).max())
     print(f"{np.degrees(spread.std(0).mean(0)).round(2)} deg/s about means of up to {means_of:.1f}")
-    outages(replays, belief, theta, program, chosen)
+    outages(replays, belief, theta, program)
 
 
 def errors(replays: list[Any], means: Any) -> np.ndarray:
@@ -118,7 +113,7 @@ def mean_of(scores: list[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([s[name] for s in scores])) for name in scores[0]}
 
 
-def outages(replays: list[Any], belief: jf.Gaussian, theta: Any, program: Any, chosen: np.ndarray) -> None:
+def outages(replays: list[Any], belief: jf.Gaussian, theta: Any, program: Any) -> None:
     """What 10 s without fixes cost, against dead reckoning from the true state with no biases known."""
     cuts = [outage(r) for r in replays]
     logs = [r.recording.log if cut is None else cut[0] for r, cut in zip(replays, cuts, strict=True)]
@@ -137,7 +132,7 @@ def outages(replays: list[Any], belief: jf.Gaussian, theta: Any, program: Any, c
     reckoned = jax.jit(lambda b, log: jf.scan_runs(jf.ekf(phantom(theta)), b, log, store=jf.mean_only))
     reckoning = jax.device_get(reckoned(jax.tree.map(lambda *b: jnp.stack(b), *starts), jf.stack(alone)))
     found: dict[str, list[tuple[float, float]]] = {"filter": [], "dead reckoning": []}
-    kept, k = [], 0
+    k = 0
     for run, cut in enumerate(cuts):
         if cut is None:
             continue
@@ -146,16 +141,11 @@ def outages(replays: list[Any], belief: jf.Gaussian, theta: Any, program: Any, c
         for name, (mean, i, row) in ends.items():
             far = float(np.linalg.norm(mean.pos[i][row] - x.pos)), float(np.linalg.norm(mean.vel[i][row] - x.vel))
             found[name].append(far)
-        kept.append(chosen[run])
         k += 1
-    print(f"\n10 s without fixes, {k} flights, at the end: median, 90th percentile; in brackets the held-out ones\n")
+    print(f"\n10 s without fixes, {k} flights, at the end: median, 90th percentile\n")
     print("| | drift (m) | velocity error (m/s) |\n|---|---|---|")
     for name, values in found.items():
-        a = np.array(values)
-        cells = []
-        for column in a.T:
-            every, out = ((np.median(c), np.quantile(c, 0.9)) for c in (column, column[~np.array(kept)]))
-            cells.append("{:.1f}, {:.1f} ({:.1f}, {:.1f})".format(*every, *out))
+        cells = [f"{np.median(column):.1f}, {np.quantile(column, 0.9):.1f}" for column in np.array(values).T]
         print(f"| {name} | {' | '.join(cells)} |")
 
 

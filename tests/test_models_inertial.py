@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from systems import add, cast, right_jacobian, skew, subtract
 
 import jaxfilt as jf
+from jaxfilt import consistency
 from jaxfilt.models import inertial_flight, sensors
 from jaxfilt.models.inertial import (
     ADIS16448,
@@ -121,7 +122,8 @@ def integrated(A: np.ndarray, density: np.ndarray, dt: float) -> np.ndarray:
     return M[n:, n:].T @ M[:n, n:]
 
 
-def scaled(P: np.ndarray, like: np.ndarray) -> np.ndarray:
+def scaled(P: Any, like: Any) -> np.ndarray:
+    """A covariance in units of the standard deviations of another."""
     size = np.sqrt(np.diag(like))
     return P / np.outer(size, size)
 
@@ -284,14 +286,23 @@ def book() -> Book:
         "baro": (lambda x, c: x[0][2:] + x[5], lambda x, c: row(p=up, d=one)),
     }
     book_sensors = {
-        name: BookSensor(h, H, lambda x, c, R=np.diag(STDS[name] ** 2): R, add, subtract, oracles_read)
+        name: BookSensor(h, H, lambda x, c, R=np.diag(STDS[name] ** 2): R, add, subtract, at_row)
         for name, (h, H) in looks.items()
     }
     return Book(f, F, Q, plus, minus, carry, book_sensors)
 
 
-def oracles_read(z: np.ndarray, k: int) -> np.ndarray:
+def at_row(z: np.ndarray, k: int) -> np.ndarray:
     return np.atleast_1d(z[k])
+
+
+@functools.cache
+def tracked(dtype: Any) -> jf.Track:
+    """The EKF over the small log, from a start that is off."""
+    start, log = small_log()
+    arguments = THETA, jf.Gaussian(off(start), np.diag(np.square(START_STD))), log
+    run = jax.jit(lambda theta, b, log: jf.scan(jf.ekf(small_model(theta)), b, log))
+    return run(*cast(arguments, dtype))
 
 
 @functools.cache
@@ -329,8 +340,7 @@ def off(start: Navigation) -> Navigation:
 def test_the_error_state_filter_of_the_book():
     start, log = small_log()
     x0, P0 = off(start), np.diag(np.square(START_STD))
-    track = jax.jit(lambda log: jf.scan(jf.ekf(small_model()), jf.Gaussian(x0, P0), log))(log)
-    by_book = book()
+    track, by_book = tracked(np.float64), book()
     begun = x0.pos, x0.vel, rotation(x0.att).as_matrix(), x0.gyro_bias, x0.accelerometer_bias, x0.extra["drift"]
     rows = []
     for k in range(len(log.dt)):
@@ -357,11 +367,7 @@ def test_the_error_state_filter_of_the_book():
 
 
 def test_single_precision_is_near_double():
-    start, log = small_log()
-    step = jax.jit(lambda theta, b, log: jf.scan(jf.ekf(small_model(theta)), b, log))
-    P0 = np.diag(np.square(START_STD))
-    arguments = THETA, jf.Gaussian(off(start), P0), log
-    wide, narrow = (step(*cast(arguments, dtype)) for dtype in (np.float64, np.float32))
+    wide, narrow = tracked(np.float64), tracked(np.float32)
     assert {a.dtype for a in jax.tree.leaves(narrow)} == {np.dtype(np.float32), np.dtype(np.int32)}
     std = np.sqrt(np.einsum("tii->ti", wide.belief.cov))
     away = jax.vmap(small_model().space.minus)(cast(narrow.belief.mean, np.float64), wide.belief.mean)
@@ -471,5 +477,58 @@ def test_the_flight_follows_its_path_and_the_input_is_what_the_imu_reads():
     assert np.abs((turned - log.u.gyro[1:]).mean(0)).max() < 0.002
 
 
-def anees(found: Any, name: str) -> dict[str, str]:
-    return {block: jf.consistency.verdict(c) for block, c in found.scores[name].nees_total.items()}
+BLOCKS = inertial_flight.NAVIGATION_BLOCKS | {"drift": ((15,), "m")}
+
+
+def verdicts(s: jf.Scenario, filters: dict, theta: Any, runs: int, steps: int) -> dict[str, dict[str, str]]:
+    """filter -> block -> whether its ANEES is inside its bounds; the truth flies by the scenario's own theta."""
+    found = jf.study(
+        s.model, filters, s.belief, s.schedule(steps), jax.random.key(1), theta=theta, truth_theta=s.theta,
+        runs=runs, control=s.control, blocks=s.blocks, backend="xla",
+    )  # fmt: skip
+    return {
+        name: {block: consistency.verdict(c) for block, c in scores.nees_total.items()}
+        for name, scores in found.scores.items()
+    }
+
+
+@pytest.mark.long
+def test_the_filter_is_consistent_outdoors_and_not_with_another_noise():
+    s = inertial_flight.inertial_gnss_scenario()
+    filters = {"ekf": lambda theta: jf.ekf(s.model(theta))}
+    found = verdicts(s, filters, s.theta, 100, 200)["ekf"]
+    assert set(found.values()) == {"inside"}, found
+    assert set(found) == {"state", *BLOCKS}
+    timid = s.theta | {
+        "gnss": tuple(log_std + math.log(2) for log_std in s.theta["gnss"])
+    }  # R assumed 4 times as large
+    assert verdicts(s, filters, timid, 100, 200)["ekf"]["position"] == "below"
+    bold = s.theta | {"accelerometer": s.theta["accelerometer"] - math.log(2)}  # Q assumed 4 times as small
+    assert verdicts(s, filters, bold, 100, 200)["ekf"]["velocity"] == "above"
+
+
+@pytest.mark.long
+def test_every_sensor_at_once():
+    """A row in which all of them speak: finite, with finite gradients in all that theta has, and believed."""
+    s = inertial_flight.inertial_scenario()
+    row = s.schedule(1)._replace(valid={})
+    theta = jax.tree.map(jnp.asarray, s.theta)
+    simulated = jax.jit(lambda key: jf.simulate(s.model(theta), s.belief(theta), row, key, s.control).log)
+    row = jax.tree.map(lambda a: a[0], simulated(jax.random.key(5)))
+
+    def loss(theta: Any) -> tuple[Any, Any]:
+        belief, info = jf.ekf(s.model(theta)).step(s.belief(theta), row)
+        return -sum(one.loglik for one in info.values()), (belief, info)
+
+    (_, (belief, info)), slopes = jax.jit(jax.value_and_grad(loss, has_aux=True))(theta)
+    assert set(info) == {"gnss", "magnetometer", "barometer", "finder", "flow", "ranges", "camera"}
+    for name, one in info.items():
+        assert one.status == jf.Status.OK
+        assert one.nis < 25, name
+    before = np.sqrt(np.diag(s.belief(theta).cov))
+    after = np.sqrt(np.diag(belief.cov))
+    assert (after[[0, 1, 2, 19]] < before[[0, 1, 2, 19]]).all()
+    flat = {jax.tree_util.keystr(path): float(a) for path, a in jax.tree.leaves_with_path(slopes)}
+    assert all(map(math.isfinite, flat.values())), flat
+    silent = {name for name, slope in flat.items() if slope == 0}
+    assert not silent, silent

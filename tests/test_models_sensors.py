@@ -93,7 +93,7 @@ def test_a_late_sensor_tells_of_the_past():
     nav = Navigation(*jnp.zeros((2, 3)), POSES[1][2], *jnp.zeros((2, 3)))
     R = POSES[1][1]
     imu = Imu(jnp.asarray(rates), jnp.asarray(R.inv().apply([0, 0, 9.81])))
-    gnss = s.late(s.gnss_position(jnp.eye(3), arm=ARM), lateness, strapdown)
+    gnss = s.late(s.gnss_position(jnp.eye(3), arm=ARM), lateness, lambda x, u, dt: (strapdown(x, u, dt), u))
     past = (R * Rotation.from_rotvec(-lateness * rates)).apply(np.asarray(ARM))
     np.testing.assert_allclose(gnss.h(nav, imu) - strapdown(nav, imu, -lateness).pos, past, atol=1e-12)
     # the slope by the lateness is the velocity, so that it can be tuned

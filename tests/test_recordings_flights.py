@@ -118,7 +118,7 @@ FLIGHTS = ("Horizontal_path_06", "Horizontal_path_08")
 
 @functools.cache
 def phantoms() -> tuple[list[Any], Any]:
-    """Two held-out flights with two sensors each."""
+    """Two flights with two sensors each."""
     loaded = [datasets.load("ansfl_phantom4", flight) for flight in FLIGHTS]
     replays = [phantom.ansfl_phantom4(data, imu) for data in loaded for imu in (1, 4)]
 

@@ -65,7 +65,8 @@ def test_equals_a_plain_loop(build):
     np.testing.assert_allclose(track.info["z"].nis, nis, rtol=1e-10)
     np.testing.assert_allclose(track.info["z"].loglik, loglik, rtol=1e-10)
     np.testing.assert_allclose(track.info["z"].ratio, nis / stats.chi2.ppf(PROBABILITY, 3), rtol=1e-9)
-    assert (track.info["z"].dof == 3).all() and (track.info["z"].status == jf.Status.OK).all()
+    assert (track.info["z"].dof == 3).all()
+    assert (track.info["z"].status == jf.Status.OK).all()
 
 
 def test_is_the_plain_filter_where_nothing_is_far_off():

@@ -59,8 +59,8 @@ def attitude(theta: PyTree = HAND_HELD, gravity: float = GRAVITY) -> Model:
     """Attitude and gyroscope bias: ``q' = q Exp(dt (u - b))``, and two vectors of the world seen in the body.
 
     ``f = R(q)' g e_z + v``: an accelerometer at rest, so that v holds what the body accelerates, and its standard
-    deviation is that of the motion. (A variance that grows with ``(|f| - g)^2``, as many have it, did not help on real fast motion
-    worse: half of what a body accelerates does not show in the length.)
+    deviation is that of the motion. (A variance that grows with ``(|f| - g)^2``, as many have it, did not help in real
+    fast motion: half of what a body accelerates does not show in the length.)
 
     ``m = R(q)' (B cos dip sin decl, B cos dip cos decl, -B sin dip) + v``: a magnetometer. Instead of it "heading" uses
     only in which direction of the compass the reading points, turned by the estimated attitude: iron that changes the

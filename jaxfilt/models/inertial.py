@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxfilt import doors
 from jaxfilt.models.control import GRAVITY
+from jaxfilt.models.sensors import positioning
 from jaxfilt.spaces import product, rotate, so3, vector
 from jaxfilt.types import Array, Model, PyTree, Sensor, Space
 
@@ -261,11 +262,11 @@ def late(
         [-1.0, 0.0, 0.0]
     """
 
-    def then(x: Navigation, c: PyTree) -> tuple[Navigation, PyTree]:
+    def ahead(x: Navigation, c: PyTree, dt: Array) -> tuple[Navigation, PyTree]:
         u, inner = imu(x, c)
-        return strapdown(x, u, -seconds, gravity), inner
+        return strapdown(x, u, dt, gravity), inner
 
-    return Sensor(lambda x, c: sensor.h(*then(x, c)), lambda x, c: sensor.R(*then(x, c)), sensor.space)
+    return positioning.late(sensor, seconds, ahead)
 
 
 def _check(theta: PyTree, sensors: Mapping[str, Sensor], extra: Mapping[str, Wander], remember: bool) -> None:

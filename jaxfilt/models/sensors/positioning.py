@@ -153,12 +153,16 @@ def barometer(R: Array, drift: Option = 0.0) -> Sensor:
     return Sensor(lambda x, c: x.pos[2] + chosen(drift, x, x.pos), const(R), scalar)
 
 
-def coast(x: PyTree, c: PyTree, dt: Array) -> PyTree:
+def coast(x: PyTree, c: PyTree, dt: Array) -> tuple[PyTree, PyTree]:
     """A state with fields ``pos`` and ``vel``, dt seconds on: the position moves, all else stays."""
-    return x._replace(pos=x.pos + dt * x.vel)
+    return x._replace(pos=x.pos + dt * x.vel), c
 
 
-def late(sensor: Sensor, seconds: Array | float, ahead: Callable[[PyTree, PyTree, Array], PyTree] = coast) -> Sensor:
+def late(
+    sensor: Sensor,
+    seconds: Array | float,
+    ahead: Callable[[PyTree, PyTree, Array], tuple[PyTree, PyTree]] = coast,
+) -> Sensor:
     """A sensor whose stamps come ``seconds`` after what they tell of: ``h(x(t - seconds), c)``.
 
     For a small offset, a constant that is to be tuned; a known one is better taken off the stamps, by
@@ -168,8 +172,8 @@ def late(sensor: Sensor, seconds: Array | float, ahead: Callable[[PyTree, PyTree
     Args:
         sensor: as it would read in time.
         seconds: () s; negative where the stamps are early.
-        ahead: function (x, c, dt) -> the state dt seconds on, here called with -seconds. For an inertial state with
-            the IMU's reading as context: ``lambda x, u, dt: strapdown(x, u, dt)``.
+        ahead: function (x, c, dt) -> the state dt seconds on, here called with -seconds, and the context of ``sensor``.
+            Of an inertial state it is `jaxfilt.models.inertial.late` that knows how.
 
     Example: GNSS that tells of where the drone was 0.1 s ago.
         >>> import jax.numpy as jnp
@@ -180,5 +184,5 @@ def late(sensor: Sensor, seconds: Array | float, ahead: Callable[[PyTree, PyTree
         [-1.0, 0.0, 0.0]
     """
     return Sensor(
-        lambda x, c: sensor.h(ahead(x, c, -seconds), c), lambda x, c: sensor.R(ahead(x, c, -seconds), c), sensor.space
+        lambda x, c: sensor.h(*ahead(x, c, -seconds)), lambda x, c: sensor.R(*ahead(x, c, -seconds)), sensor.space
     )
