@@ -496,15 +496,18 @@ def verdicts(s: jf.Scenario, filters: dict, theta: Any, runs: int, steps: int) -
 def test_the_filter_is_consistent_outdoors_and_not_with_another_noise():
     s = inertial_flight.inertial_gnss_scenario()
     filters = {"ekf": lambda theta: jf.ekf(s.model(theta))}
-    found = verdicts(s, filters, s.theta, 100, 200)["ekf"]
+    found = verdicts(s, filters, s.theta, 100, 500)["ekf"]
     assert set(found.values()) == {"inside"}, found
     assert set(found) == {"state", *BLOCKS}
-    timid = s.theta | {
-        "gnss": tuple(log_std + math.log(2) for log_std in s.theta["gnss"])
-    }  # R assumed 4 times as large
-    assert verdicts(s, filters, timid, 100, 200)["ekf"]["position"] == "below"
-    bold = s.theta | {"accelerometer": s.theta["accelerometer"] - math.log(2)}  # Q assumed 4 times as small
-    assert verdicts(s, filters, bold, 100, 200)["ekf"]["velocity"] == "above"
+
+    def wrong(factor: float, *names: str) -> dict:
+        off = {name: jax.tree.map(lambda a: a + math.log(factor), s.theta[name]) for name in names}
+        return verdicts(s, filters, s.theta | off, 100, 500)["ekf"]
+
+    timid = wrong(2.0, "gnss", "doppler", "magnetometer", "barometer")  # R assumed 4 times as large
+    assert {timid[block] for block in ("state", "position", "velocity", "attitude")} == {"below"}
+    bold = wrong(0.5, "gyro", "accelerometer", "gyro_walk", "accelerometer_walk", "drift")  # Q 4 times as small
+    assert bold["state"] == "above"
 
 
 @pytest.mark.long
