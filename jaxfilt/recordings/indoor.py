@@ -63,7 +63,7 @@ def ranging_drone(theta: PyTree = INDOOR_DRONE) -> Model:
         (5.0, 1.5)
     """
     horizontal, vertical = map(jnp.exp, theta["acceleration"])
-    late_range, late_height = theta["late"]
+    late = theta["late"][1]
 
     def f(x: Moving, u: PyTree, dt: Array) -> Moving:
         return Moving(x.pos + dt * x.vel, x.vel)
@@ -71,17 +71,19 @@ def ranging_drone(theta: PyTree = INDOOR_DRONE) -> Model:
     def Q(x: Moving, u: PyTree, dt: Array) -> Array:
         return jnp.kron(white_acceleration(dt), diagonal(horizontal, horizontal, vertical))
 
-    def anchor(k: int) -> Sensor:
-        bias = theta["bias"][k]
-        return Sensor(
-            lambda x, c: range_to(x.pos - late_range * x.vel, c, bias),
-            const(diagonal(jnp.exp(theta["range"][k]))),
-            scalar,
-        )
+    height = Sensor(lambda x, c: x.pos[2] - late * x.vel[2], const(diagonal(jnp.exp(theta["height"]))), scalar)
+    return Model(f, Q, product(Moving(vector(3), vector(3))), {**ranges_to_anchors(theta), "height": height})
 
-    ranges = {f"range_{k + 1}": anchor(k) for k in range(ANCHORS)}
-    height = Sensor(lambda x, c: x.pos[2] - late_height * x.vel[2], const(diagonal(jnp.exp(theta["height"]))), scalar)
-    return Model(f, Q, product(Moving(vector(3), vector(3))), {**ranges, "height": height})
+
+def ranges_to_anchors(theta: PyTree) -> dict[str, Sensor]:
+    """The sensors "range_1" ... "range_8" of a state with fields pos and vel, and of a theta as `ranging_drone`'s."""
+
+    def anchor(k: int) -> Sensor:
+        bias, late = theta["bias"][k], theta["late"][0]
+        noise = const(diagonal(jnp.exp(theta["range"][k])))
+        return Sensor(lambda x, c: range_to(x.pos - late * x.vel, c, bias), noise, scalar)
+
+    return {f"range_{k + 1}": anchor(k) for k in range(ANCHORS)}
 
 
 def crazyflie_uwb(data: Dataset) -> Replay:

@@ -11,10 +11,10 @@ from jaxfilt.datasets import Dataset
 from jaxfilt.log import align, merge
 from jaxfilt.models.inertial import Imu, Navigation, inertial
 from jaxfilt.models.parts import start
-from jaxfilt.models.sensors import ground_flow, range_to, tilt_range
+from jaxfilt.models.sensors import ground_flow, tilt_range
 from jaxfilt.noise import const, diagonal
 from jaxfilt.recordings.imu import imu_at, imu_input, level
-from jaxfilt.recordings.indoor import ANCHORS, INDOOR_DRONE
+from jaxfilt.recordings.indoor import INDOOR_DRONE, ranges_to_anchors
 from jaxfilt.spaces import scalar, vector
 from jaxfilt.types import Array, Gaussian, Model, Replay, Sensor, Stream
 
@@ -61,25 +61,16 @@ def inertial_drone(theta: dict = INERTIAL_DRONE) -> Model:
         >>> float(inertial_drone().sensors["height"].h(x, ()))
         2.0
     """
-    late_range, late_height = theta["late"]
-
-    def anchor(k: int) -> Sensor:
-        bias = theta["bias"][k]
-        return Sensor(
-            lambda x, c: range_to(x.pos - late_range * x.vel, c, bias),
-            const(diagonal(jnp.exp(theta["range"][k]))),
-            scalar,
-        )
 
     def height(x: Navigation, c: tuple) -> Array:
-        return tilt_range(x.pos[2] - late_height * x.vel[2], x.att)
+        return tilt_range(x.pos[2] - theta["late"][1] * x.vel[2], x.att)
 
     def flow(x: Navigation, c: Imu) -> Array:
         distance = jnp.maximum(tilt_range(x.pos[2], x.att), LOWEST)
         return -jnp.exp(theta["flow_scale"]) * ground_flow(x.vel, x.att, c.gyro - x.gyro_bias, distance)
 
     pixels = jnp.exp(theta["flow"])
-    sensors = {f"range_{k + 1}": anchor(k) for k in range(ANCHORS)} | {
+    sensors = ranges_to_anchors(theta) | {
         "height": Sensor(height, const(diagonal(jnp.exp(theta["height"]))), scalar),
         "flow": Sensor(flow, const(diagonal(pixels, pixels)), vector(2)),
     }
@@ -92,8 +83,7 @@ def crazyflie_uwb_inertial(data: Dataset) -> Replay:
     It starts at rest on the floor, 2 m (one standard deviation) about the middle of the anchors, level by what its
     accelerometer reads, with a yaw of 0 give or take 0.1 rad: it is held near 0 in all flights, says the set's README.
     The truth is for scoring, but for what was measured with it on all flights: that the IMU's stamps are 0.06 s late,
-    the scale of the flow and its noise. A share of the
-    ranges to some anchors is off by metres: robust, or a gate.
+    the scale of the flow and its noise. A share of the ranges to some anchors is off by metres: robust, or a gate.
     """
     gyro, accelerometer = data.inputs["gyro"], data.inputs["accelerometer"]
     stamps, readings = imu_input(gyro, accelerometer)
