@@ -184,5 +184,5 @@ def test_the_number_of_rows_is_a_whole_number(rows):
 
 def test_an_input_stays_in_force_when_its_row_is_no_longer_kept():
     turned = (0.5, None, None, (np.array(2.0), np.array(0.3)))
-    fixes = [(float(t), {"fix": np.full(2, t)}, None, None) for t in range(1, 7)]
+    fixes = [(t, {"fix": np.full(2, t)}, None, None) for t in np.arange(1.0, 7.0)]
     same(arrived(online(4), [turned, *fixes]), arrived(online(20), [turned, *fixes]))
