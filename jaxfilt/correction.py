@@ -55,8 +55,8 @@ def thresholds_of(argument: str, model: Model, gate: Gate) -> dict[str, np.ndarr
 def correct_belief(
     recipe: Recipe, model: Model, name: str, belief: Gaussian, z: PyTree, c: PyTree, mask: Array | None
 ) -> tuple[Gaussian, Info]:
-    """The belief after a reading z of the sensor of this name, and what is reported of it; both as if it had not come,
-    but for the report, where a gate refuses it."""
+    """The belief after a reading z of the sensor of this name, and what is reported of it; the belief stays as it was
+    where a gate refuses the reading."""
     sensor, dtype = model.sensors[name], belief.cov.dtype
 
     def h(x: PyTree) -> PyTree:

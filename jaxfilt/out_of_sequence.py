@@ -127,8 +127,9 @@ def out_of_sequence(filter: Filter, rows: int, u: PyTree = (), c: Mapping[str, P
         row = Row(jnp.asarray(t, dtype), log, jnp.asarray(u is not None), rank, room.begin.belief)
         taken = (row.t >= room.begin.t) & jnp.isfinite(row.t)
         place = ((room.rows.t < row.t) | ((room.rows.t == row.t) & (room.rows.rank <= rank))).sum(dtype=jnp.int32)
-        beliefs, infos = _run_again(filter, room.begin, _inserted(room.rows, row, place), place)
-        after = room._replace(rows=_inserted(room.rows, row, place)._replace(belief=beliefs))
+        ordered = _inserted(room.rows, row, place)
+        beliefs, infos = _run_again(filter, room.begin, ordered, place)
+        after = room._replace(rows=ordered._replace(belief=beliefs))
         backlog = jax.tree.map(lambda new, old: jnp.where(taken, new, old), after, backlog)
         info = {name: jax.tree.map(lambda a: a[place], infos[name]) for name in z}
         return backlog, Arrival(_latest(backlog), info, taken)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxfilt.elementary import bearing, norm, wrap
 from jaxfilt.log import schedule
 from jaxfilt.models.control import GRAVITY
+from jaxfilt.models.sensors import body_field, specific_force
 from jaxfilt.noise import const, diagonal
 from jaxfilt.spaces import (
     angle,
@@ -106,7 +107,7 @@ def attitude(theta: PyTree = HAND_HELD, gravity: float = GRAVITY) -> Model:
         return jnp.block([[jnp.diag(dt * white) + dt**3 / 3 * W, both], [both, dt * W]])
 
     def up(x: Attitude, c: PyTree) -> Array:
-        return rotate_back(x.att, jnp.asarray([0.0, 0.0, gravity], x.att.dtype))
+        return specific_force(x.att, gravity=gravity)
 
     def compass(x: Attitude, c: Array) -> Array:
         return wrap(bearing(rotate(x.att, c)[:2]) - bearing(north[:2]))
@@ -115,7 +116,7 @@ def attitude(theta: PyTree = HAND_HELD, gravity: float = GRAVITY) -> Model:
     sensors = {
         "accelerometer": Sensor(up, const(diagonal(*motion)), vector(3)),
         "magnetometer": Sensor(
-            lambda x, c: rotate_back(x.att, north.astype(x.att.dtype)), const(diagonal(*magnetic)), vector(3)
+            lambda x, c: body_field(x.att, north.astype(x.att.dtype)), const(diagonal(*magnetic)), vector(3)
         ),
         "heading": Sensor(compass, const(diagonal(across)), angle),
     }
@@ -141,10 +142,15 @@ def attitude_start(theta: PyTree, att: Array, gyro_bias: Array | None = None) ->
     """
     tilt, heading, bias = (jnp.exp(jnp.asarray(log_std)) for log_std in theta["start"])
     att = jnp.asarray(att, tilt.dtype)
-    R = jnp.stack([rotate_back(att, axis) for axis in jnp.eye(3, dtype=tilt.dtype)], axis=1)
-    none = jnp.zeros((3, 3), tilt.dtype)
-    cov = jnp.block([[R @ diagonal(tilt, tilt, heading) @ R.T, none], [none, diagonal(bias, bias, bias)]])
+    cov = jax.scipy.linalg.block_diag(attitude_spread(att, tilt, heading), diagonal(bias, bias, bias))
     return Gaussian(Attitude(att, jnp.asarray(np.zeros(3) if gyro_bias is None else gyro_bias, tilt.dtype)), cov)
+
+
+def attitude_spread(att: Array, tilt: Array, heading: Array) -> jax.Array:
+    """Covariance (3, 3) rad^2 about the body's axes of an attitude (4,) that errs about those of the world: by a
+    standard deviation ``tilt`` (rad) about each horizontal one, and ``heading`` (rad) about the vertical."""
+    turn = jnp.stack([rotate_back(att, axis) for axis in jnp.eye(3, dtype=att.dtype)], axis=1)
+    return turn @ diagonal(tilt, tilt, heading) @ turn.T
 
 
 def _swing_and_turn(q: Array) -> tuple[jax.Array, jax.Array]:

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilt.filters import ekf
+from jaxfilt.models.attitude import attitude_spread
 from jaxfilt.models.inertial import Navigation
 from jaxfilt.noise import diagonal
 from jaxfilt.run import scan_runs
-from jaxfilt.spaces import rotate_back
 from jaxfilt.types import Array, Gaussian, Info, Log, Model
 
 
@@ -41,8 +41,7 @@ def about(
     p, v, tilt, bg, ba = (jnp.asarray(s) for s in stds)
     dtype = p.dtype
     pos, att = (jnp.asarray(a, dtype) for a in (pos, att))
-    turn = jnp.stack([rotate_back(att, axis) for axis in jnp.eye(3, dtype=dtype)], axis=1)
-    around = turn @ diagonal(tilt, tilt, jnp.asarray(yaw_std, dtype)) @ turn.T
+    around = attitude_spread(att, tilt, jnp.asarray(yaw_std, dtype))
     more = {name: jnp.asarray(std, dtype) for name, std in sorted(extra.items())} if extra else {}
     parts = [diagonal(p, p, p, v, v, v), around, diagonal(bg, bg, bg, ba, ba, ba)]
     parts += [jnp.diag(std**2) for std in more.values()]

@@ -9,12 +9,12 @@ import numpy as np
 
 from jaxfilt.datasets import Dataset
 from jaxfilt.log import align, merge
-from jaxfilt.models.parts import start, white_acceleration
+from jaxfilt.models.parts import start
 from jaxfilt.models.sensors import range_to
 from jaxfilt.noise import const, diagonal
-from jaxfilt.recordings.indoor import Moving
-from jaxfilt.spaces import product, scalar, vector
-from jaxfilt.types import Array, Gaussian, Model, PyTree, Replay, Sensor
+from jaxfilt.recordings.indoor import Moving, moving
+from jaxfilt.spaces import scalar, vector
+from jaxfilt.types import Gaussian, Model, PyTree, Replay, Sensor
 
 ANCHORS = 4
 
@@ -51,17 +51,8 @@ def anchored_drone(theta: PyTree = ANCHORED) -> Model:
         >>> round(float(anchored_drone().sensors["range_1"].h(x, jnp.array([0.0, 0.0, 1.5]))), 4)
         5.2
     """
-    horizontal, vertical = map(jnp.exp, theta["acceleration"])
-
-    def f(x: Moving, u: PyTree, dt: Array) -> Moving:
-        return Moving(x.pos + dt * x.vel, x.vel)
-
-    def Q(x: Moving, u: PyTree, dt: Array) -> Array:
-        return jnp.kron(white_acceleration(dt), diagonal(horizontal, horizontal, vertical))
-
     anchor = Sensor(lambda x, c: range_to(x.pos, c, theta["bias"]), const(diagonal(jnp.exp(theta["range"]))), scalar)
-    sensors = {f"range_{k + 1}": anchor for k in range(ANCHORS)}
-    return Model(f, Q, product(Moving(vector(3), vector(3))), sensors)
+    return moving(theta, {f"range_{k + 1}": anchor for k in range(ANCHORS)})
 
 
 def rcv_uwb_drone(data: Dataset) -> Replay:

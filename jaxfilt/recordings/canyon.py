@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilt.datasets import Dataset
-from jaxfilt.elementary import norm
 from jaxfilt.log import align, merge
 from jaxfilt.models.parts import arc, start, white_acceleration
+from jaxfilt.models.sensors import pseudorange
 from jaxfilt.models.wheeled import Odometry
 from jaxfilt.noise import diagonal
 from jaxfilt.spaces import angle, product, scalar, vector
@@ -117,9 +117,7 @@ def canyon_car(theta: PyTree) -> Model:
         return jax.scipy.linalg.block_diag(plane, rest, clock, dt * diagonal(std["glonass"]))
 
     def h(x: Tracked, c: Satellite) -> Array:
-        # |place - pos| - |place| as a quotient: the difference of the squares over the sum, which cancels nothing.
-        nearer = (x.pos @ x.pos - 2 * (c.place @ x.pos)) / (norm(c.place - x.pos) + norm(c.place))
-        return nearer + x.clock[0] + jnp.where(c.system == GLONASS, x.glonass, 0.0)
+        return pseudorange(x.pos, c.place, x.clock[0] + jnp.where(c.system == GLONASS, x.glonass, 0.0))
 
     def R(x: Tracked, c: Satellite) -> Array:
         weak = std["share"] * 10 ** ((45 - c.cn0) / 20)

@@ -62,8 +62,20 @@ def ranging_drone(theta: PyTree = INDOOR_DRONE) -> Model:
         >>> float(model.sensors["range_8"].h(x, jnp.array([0.0, 0.0, 1.5]))), float(model.sensors["height"].h(x, ()))
         (5.0, 1.5)
     """
-    horizontal, vertical = map(jnp.exp, theta["acceleration"])
     late = theta["late"][1]
+
+    height = Sensor(lambda x, c: x.pos[2] - late * x.vel[2], const(diagonal(jnp.exp(theta["height"]))), scalar)
+    return moving(theta, {**ranges_to_anchors(theta), "height": height})
+
+
+def moving(theta: PyTree, sensors: dict[str, Sensor]) -> Model:
+    """A point with white acceleration of one density along each horizontal axis and another upwards, on `Moving`.
+
+    Args:
+        theta: logarithms of acceleration (horizontal, vertical; (m/s)/sqrt(s)).
+        sensors: whatever measures it.
+    """
+    horizontal, vertical = map(jnp.exp, theta["acceleration"])
 
     def f(x: Moving, u: PyTree, dt: Array) -> Moving:
         return Moving(x.pos + dt * x.vel, x.vel)
@@ -71,8 +83,7 @@ def ranging_drone(theta: PyTree = INDOOR_DRONE) -> Model:
     def Q(x: Moving, u: PyTree, dt: Array) -> Array:
         return jnp.kron(white_acceleration(dt), diagonal(horizontal, horizontal, vertical))
 
-    height = Sensor(lambda x, c: x.pos[2] - late * x.vel[2], const(diagonal(jnp.exp(theta["height"]))), scalar)
-    return Model(f, Q, product(Moving(vector(3), vector(3))), {**ranges_to_anchors(theta), "height": height})
+    return Model(f, Q, product(Moving(vector(3), vector(3))), sensors)
 
 
 def ranges_to_anchors(theta: PyTree) -> dict[str, Sensor]:
