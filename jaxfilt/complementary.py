@@ -6,21 +6,19 @@ replays take them.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfilt import doors, linalg
+from jaxfilt import doors
 from jaxfilt.correction import image, nothing
 from jaxfilt.elementary import bearing, norm
+from jaxfilt.prediction import advanced, branch, canonical, interval, predictor, stepper
 from jaxfilt.spaces import rotate, rotate_back, so3, so3_log
 from jaxfilt.transforms import taylor
-from jaxfilt.types import Array, Filter, Gaussian, Info, Log, Model, PyTree, Sensor, Status
-
-Update = Callable[..., tuple[Gaussian, Info]]
+from jaxfilt.types import Array, Filter, Gaussian, Info, Model, PyTree, Sensor, Status
 
 
 def complementary(
@@ -74,9 +72,12 @@ def complementary(
     def predict(belief: Gaussian, u: PyTree = (), dt: Array | float = 0.0) -> Gaussian:
         belief = _without_covariance(belief, model)
         doors.inputs("u", u, belief.cov.dtype)
-        moves, dt = _interval(dt, belief)
-        y = image("f(x, u, dt)", _moved(model, belief.mean, u, dt), model.space, belief.cov.dtype)
-        return belief._replace(mean=jax.tree.map(lambda new, old: jnp.where(moves, new, old), y, belief.mean))
+        moves, dt = interval(dt, belief)
+
+        def on(b: Gaussian) -> Gaussian:
+            return b._replace(mean=advanced(model, b.mean, u, dt, b.cov.dtype))
+
+        return branch(moves, on, lambda b: b, belief)
 
     def update(
         belief: Gaussian, z: PyTree, sensor: str, c: PyTree = (), mask: Array | None = None
@@ -103,7 +104,7 @@ def complementary(
         kept = jax.tree.map(lambda new, old: jnp.where(there, new, old), (moved, told), (x, silent))
         return belief._replace(mean=kept[0]), kept[1]
 
-    return Filter(predict, update, _stepped(model, predict, update), model)
+    return Filter(predict, update, stepper(model, predict, update), model)
 
 
 def dead_reckoning(model: Model) -> Filter:
@@ -124,27 +125,14 @@ def dead_reckoning(model: Model) -> Filter:
     """
     doors.instance("model", model, Model)
 
-    def predict(belief: Gaussian, u: PyTree = (), dt: Array | float = 0.0) -> Gaussian:
-        belief = _canonical(belief, model)
-        dtype = belief.cov.dtype
-        doors.inputs("u", u, dtype)
-        moves, dt = _interval(dt, belief)
-
-        def f(x: PyTree) -> PyTree:
-            return image("f(x, u, dt)", _moved(model, x, u, dt), model.space, dtype)
-
-        m = taylor(f, belief, model.space, model.space)
-        Q = doors.call("Q(x, u, dt)", model.Q, x=belief.mean, u=u, dt=dt)
-        doors.noise("Q(x, u, dt)", Q, model.space.dim, dtype)
-        later = Gaussian(m.mean, linalg.symmetrize(m.cov + Q))
-        return jax.tree.map(lambda new, old: jnp.where(moves, new, old), later, belief)
+    predict = predictor(taylor, model)
 
     def update(
         belief: Gaussian, z: PyTree, sensor: str, c: PyTree = (), mask: Array | None = None
     ) -> tuple[Gaussian, Info]:
         return belief, nothing(doors.sensor(model, sensor).space.dim, belief.cov.dtype)
 
-    return Filter(predict, update, _stepped(model, predict, update), model)
+    return Filter(predict, update, stepper(model, predict, update), model)
 
 
 def _checked(model: Model, share: Mapping[str, Array | float], integral: Mapping[str, Array | float]) -> None:
@@ -163,30 +151,9 @@ def _checked(model: Model, share: Mapping[str, Array | float], integral: Mapping
         raise KeyError(f"integral: expected sensors that have a share, {list(share)}, got {sorted(strangers)}")
 
 
-def _canonical(belief: Gaussian, model: Model) -> Gaussian:
-    doors.belief("belief", belief, model.space)
-    dtype = jax.dtypes.canonicalize_dtype(belief.cov.dtype)
-    return Gaussian(*jax.tree.map(lambda a: jnp.asarray(a, dtype), tuple(belief)))
-
-
 def _without_covariance(belief: Gaussian, model: Model) -> Gaussian:
-    belief = _canonical(belief, model)
+    belief = canonical(belief, model.space)
     return belief._replace(cov=jnp.zeros_like(belief.cov))
-
-
-def _interval(dt: Array | float, belief: Gaussian) -> tuple[Array, jax.Array]:
-    """Whether time passes; and how much, 1 s where none does, since f may not like 0."""
-    if np.shape(dt) != ():
-        raise ValueError(f"dt: expected a scalar, got shape {np.shape(dt)}")
-    if doors.is_concrete(dt) and not 0 <= float(dt) < math.inf:
-        raise ValueError(f"dt: expected a finite interval >= 0 s, got {float(dt)}")
-    doors.same_dtype(belief.cov.dtype, dt=dt)
-    dt = jnp.asarray(dt, belief.cov.dtype)
-    return dt > 0, jnp.where(dt > 0, dt, 1.0)
-
-
-def _moved(model: Model, x: PyTree, u: PyTree, dt: jax.Array) -> PyTree:
-    return doors.call("f(x, u, dt)", model.f, x=x, u=u, dt=dt)
 
 
 def _smallest_turn(z: Array, expected: Array) -> jax.Array:
@@ -216,22 +183,3 @@ def _told(sensor: Sensor, x: PyTree, moved: PyTree, z: Array, expected: Array, s
         finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
         status = jnp.where(finite, status, jnp.int32(code))
     return silent._replace(innovation=sensor.space.minus(z, expected), status=status)
-
-
-def _stepped(model: Model, predict: Callable[..., Gaussian], update: Update) -> Callable:
-    """One row: predict, then update with each sensor that is there, in the model's order."""
-
-    def step(belief: Gaussian, row: Log) -> tuple[Gaussian, dict[str, Info]]:
-        doors.tables("row", row, model)
-        belief = predict(belief, row.u, row.dt)
-        infos = {}
-        for name, sensor in model.sensors.items():
-            if name in row.z:
-                mask = None
-                if name in row.valid:
-                    doors.mask(f"row.valid[{name!r}]", row.valid[name], (), (sensor.space.dim,))
-                    mask = jnp.broadcast_to(jnp.asarray(row.valid[name]), (sensor.space.dim,))
-                belief, infos[name] = update(belief, row.z[name], name, row.c.get(name, ()), mask)
-        return belief, infos
-
-    return step

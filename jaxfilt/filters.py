@@ -11,18 +11,15 @@ update-first.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
-from jaxfilt import doors, linalg
-from jaxfilt.correction import Gate, Recipe, correct_belief, image, nothing, thresholds_of
+from jaxfilt import doors
+from jaxfilt.correction import Gate, Recipe, correct_belief, thresholds_of
+from jaxfilt.prediction import canonical, predictor, stepper
 from jaxfilt.transforms import Transform, cubature, taylor, taylor_at, unscented
-from jaxfilt.types import Array, Filter, Gaussian, Info, Log, Model, PyTree, Space
+from jaxfilt.types import Array, Filter, Gaussian, Info, Model, PyTree
 
 
 def kf(model: Model, gate: Gate = None, robust: Gate = None) -> Filter:
@@ -133,79 +130,16 @@ def build(
     gates, limits = thresholds_of("gate", model, gate), thresholds_of("robust", model, robust)
     recipe = Recipe(transform, relinearise or (lambda _: transform), iterations, gates, limits)
 
-    def predict(belief: Gaussian, u: PyTree = (), dt: Array | float = 0.0) -> Gaussian:
-        belief = _canonical(belief, model.space)
-        doors.inputs("u", u, belief.cov.dtype)
-        moves, dt = _interval(dt, belief)
-        return _branch(moves, lambda b: _predict(transform, model, b, u, dt), lambda b: b, belief)
+    predict = predictor(transform, model)
 
     def update(
         belief: Gaussian, z: PyTree, sensor: str, c: PyTree = (), mask: Array | None = None
     ) -> tuple[Gaussian, Info]:
-        belief = _canonical(belief, model.space)
+        belief = canonical(belief, model.space)
         found = doors.sensor(model, sensor)
         doors.point(f"z[{sensor!r}]", z, found.space)
         doors.finite(f"z[{sensor!r}]", z)
         doors.same_dtype(belief.cov.dtype, **{f"z[{sensor!r}]": z})
         return correct_belief(recipe, model, sensor, belief, z, c, mask)
 
-    def step(belief: Gaussian, row: Log) -> tuple[Gaussian, dict[str, Info]]:
-        doors.tables("row", row, model)
-        belief = predict(belief, row.u, row.dt)
-        infos = {}
-        for name in model.sensors:
-            if name in row.z:
-                belief, infos[name] = _update_if_there(update, model, belief, row, name)
-        return belief, infos
-
-    return Filter(predict, update, step, model)
-
-
-def _canonical(belief: Gaussian, space: Space) -> Gaussian:
-    """The belief as arrays of one dtype, that of its covariance; a Python float in the mean is taken along."""
-    doors.belief("belief", belief, space)
-    dtype = jax.dtypes.canonicalize_dtype(belief.cov.dtype)
-    return Gaussian(*jax.tree.map(lambda a: jnp.asarray(a, dtype), tuple(belief)))
-
-
-def _interval(dt: Array | float, belief: Gaussian) -> tuple[Array | bool, jax.Array]:
-    """Whether time passes, and how much, checked."""
-    if np.shape(dt) != ():
-        raise ValueError(f"dt: expected a scalar, got shape {np.shape(dt)}")
-    if doors.is_concrete(dt) and not 0 <= float(dt) < math.inf:
-        raise ValueError(f"dt: expected a finite interval >= 0 s, got {float(dt)}")
-    doors.same_dtype(belief.cov.dtype, dt=dt)
-    return dt > 0, jnp.asarray(dt, belief.cov.dtype)
-
-
-def _branch(predicate: Array | bool, then: Callable, otherwise: Callable, belief: Gaussian) -> Any:
-    """`jax.lax.cond`, decided at once where the predicate is known: outside jit a cond would compile at every call."""
-    if doors.is_concrete(predicate):
-        return then(belief) if predicate else otherwise(belief)
-    return jax.lax.cond(predicate, then, otherwise, belief)
-
-
-def _predict(transform: Transform, model: Model, belief: Gaussian, u: PyTree, dt: jax.Array) -> Gaussian:
-    # Where vmap turns the branch on dt into a select, this one runs at dt = 0 too: keep f and Q off that point.
-    dt = jnp.where(dt > 0, dt, 1.0)
-
-    def f(x: PyTree) -> PyTree:
-        y = doors.call("f(x, u, dt)", model.f, x=x, u=u, dt=dt)
-        return image("f(x, u, dt)", y, model.space, belief.cov.dtype)
-
-    m = transform(f, belief, model.space, model.space)
-    Q = doors.call("Q(x, u, dt)", model.Q, x=belief.mean, u=u, dt=dt)
-    doors.noise("Q(x, u, dt)", Q, model.space.dim, belief.cov.dtype)
-    return Gaussian(m.mean, linalg.symmetrize(m.cov + Q))
-
-
-def _update_if_there(update: Callable, model: Model, belief: Gaussian, row: Log, name: str) -> tuple[Gaussian, Info]:
-    z, c = row.z[name], row.c.get(name, ())
-    if name not in row.valid:
-        return update(belief, z, name, c)
-    valid = row.valid[name]
-    doors.mask(f"row.valid[{name!r}]", valid, (), (model.sensors[name].space.dim,))
-    valid = np.bool_(valid) if isinstance(valid, bool) else valid
-    mask = valid if np.ndim(valid) else None
-    silence = nothing(model.sensors[name].space.dim, belief.cov.dtype)
-    return _branch(valid.any(), lambda b: update(b, z, name, c, mask), lambda b: (b, silence), belief)
+    return Filter(predict, update, stepper(model, predict, update), model)

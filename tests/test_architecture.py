@@ -15,6 +15,7 @@ FLOORS = [
     {"doors", "spaces", "consistency", "checkpoint", "devices", "loop"},
     {"noise", "log", "files", "theta_file", "integrate", "transforms", "bootstrap", "credibility", "priors"},
     {"correction"},
+    {"prediction"},
     {"models", "datasets", "filters", "complementary"},
     {"run", "simulate", "metrics", "diagnose", "check", "mismatch", "out_of_sequence"},
     {"scenarios", "recordings", "bound", "tally", "findings", "fold"},
