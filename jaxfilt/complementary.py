@@ -15,7 +15,7 @@ import numpy as np
 from jaxfilt import doors
 from jaxfilt.correction import image, nothing
 from jaxfilt.elementary import bearing, norm
-from jaxfilt.prediction import advanced, branch, canonical, interval, predictor, stepper
+from jaxfilt.prediction import advanced, branch, canonical, interval, kalman, predictor, transitioner
 from jaxfilt.spaces import rotate, rotate_back, so3, so3_log
 from jaxfilt.transforms import taylor
 from jaxfilt.types import Array, Filter, Gaussian, Info, Model, PyTree, Sensor, Status
@@ -104,7 +104,7 @@ def complementary(
         kept = jax.tree.map(lambda new, old: jnp.where(there, new, old), (moved, told), (x, silent))
         return belief._replace(mean=kept[0]), kept[1]
 
-    return Filter(predict, update, stepper(model, predict, update), model)
+    return kalman(model, predict, update, None)
 
 
 def dead_reckoning(model: Model) -> Filter:
@@ -132,7 +132,7 @@ def dead_reckoning(model: Model) -> Filter:
     ) -> tuple[Gaussian, Info]:
         return belief, nothing(doors.sensor(model, sensor).space.dim, belief.cov.dtype)
 
-    return Filter(predict, update, stepper(model, predict, update), model)
+    return kalman(model, predict, update, transitioner(taylor, model))
 
 
 def _checked(model: Model, share: Mapping[str, Array | float], integral: Mapping[str, Array | float]) -> None:

@@ -85,12 +85,12 @@ def correct_belief(
     if weight is not None:  # as if S were S / weight
         K, R = weight * K, R + (1 / weight - 1) * S
     delta = _weakened(weight, cross @ linalg.solve(S, L, r))
-    moved = _moved(model.space, belief, delta, _joseph(m.remainder, K, R))
-    info = info._replace(status=_judge(info.status, moved))
+    after = moved(model.space, belief, delta, _joseph(m.remainder, K, R))
+    info = info._replace(status=_judge(info.status, after))
     if gates is None:
-        return moved, info
+        return after, info
     refused = info.status == Status.GATED
-    belief = jax.tree.map(lambda old, new: jnp.where(refused, old, new), belief, moved)
+    belief = jax.tree.map(lambda old, new: jnp.where(refused, old, new), belief, after)
     return belief, info
 
 
@@ -139,13 +139,22 @@ def image(name: str, y: PyTree, space: Space, dtype: jnp.dtype) -> PyTree:
     return jax.tree.map(lambda a: jnp.asarray(a, dtype), y)
 
 
-def _moved(space: Space, belief: Gaussian, delta: jax.Array, P: jax.Array) -> Gaussian:
-    """The belief moved by delta, its covariance carried to the tangent space at the new mean."""
+def moved(space: Space, belief: Gaussian, delta: jax.Array, P: jax.Array) -> Gaussian:
+    """The belief moved by delta, its covariance P carried from the tangent space at the old mean to that at the new."""
     mean = space.plus(belief.mean, delta)
-    if not space.flat:
-        G = jax.jacfwd(lambda d: space.minus(space.plus(belief.mean, d), mean))(delta)
-        P = G @ P @ G.T
-    return Gaussian(mean, linalg.symmetrize(P))
+    return Gaussian(mean, linalg.symmetrize(_carried(space, belief.mean, delta, mean, P)))
+
+
+def carried(space: Space, belief: Gaussian, mean: PyTree) -> jax.Array:
+    """The belief's covariance, carried from the tangent space at its own mean to that at another."""
+    return _carried(space, belief.mean, space.minus(mean, belief.mean), mean, belief.cov)
+
+
+def _carried(space: Space, base: PyTree, delta: jax.Array, mean: PyTree, P: jax.Array) -> jax.Array:
+    if space.flat:
+        return P
+    G = jax.jacfwd(lambda d: space.minus(space.plus(base, d), mean))(delta)
+    return G @ P @ G.T
 
 
 def _mask(mask: Array | None, sensor: Sensor, name: str) -> jax.Array | None:

@@ -17,7 +17,7 @@ import jax
 
 from jaxfilt import doors
 from jaxfilt.correction import Gate, Recipe, correct_belief, thresholds_of
-from jaxfilt.prediction import canonical, predictor, stepper
+from jaxfilt.prediction import canonical, kalman, predictor, transitioner
 from jaxfilt.transforms import Transform, cubature, taylor, taylor_at, unscented
 from jaxfilt.types import Array, Filter, Gaussian, Info, Model, PyTree
 
@@ -142,4 +142,4 @@ def build(
         doors.same_dtype(belief.cov.dtype, **{f"z[{sensor!r}]": z})
         return correct_belief(recipe, model, sensor, belief, z, c, mask)
 
-    return Filter(predict, update, stepper(model, predict, update), model)
+    return kalman(model, predict, update, transitioner(transform, model))

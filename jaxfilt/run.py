@@ -8,15 +8,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxfilt import doors, linalg
+from jaxfilt import doors
 from jaxfilt import log as logs
 from jaxfilt.loop import Backend, Kept, checkpointed, loop
+from jaxfilt.prediction import dtype_of
 from jaxfilt.types import Array, Filter, Gaussian, Info, Log, PyTree, Track
 
 
 def scan(
     filter: Filter,
-    belief: Gaussian,
+    belief: Any,
     log: Log,
     store: Callable[[Any, dict[str, Info]], PyTree] = Track,
     segment: int | None = None,
@@ -27,7 +28,7 @@ def scan(
 
     Args:
         filter: from `kf`, `ekf`, `ukf`, ...
-        belief: the belief before the first row predicts.
+        belief: before the first row predicts: a Gaussian, or what else the filter carries (its `begin` makes it).
         log: T rows.
         store: function of (belief, info) after each row; what it returns is stored, T times. `mean_and_std` and
             `mean_only` are ready-made.
@@ -51,27 +52,23 @@ def scan(
     doors.instance("filter", filter, Filter)
     belief, log = _checked(filter, belief, log)
 
-    def body(b: Gaussian, row: Log) -> tuple[Gaussian, PyTree]:
+    def body(b: PyTree, row: Log) -> tuple[PyTree, PyTree]:
         b, info = filter.step(b, row)
         return b, store(b, info)
 
     return checkpointed(body, belief, log, segment)[1]
 
 
-def _checked(filter: Filter, belief: Gaussian, log: Log) -> tuple[Gaussian, Log]:
-    """The belief and the log as arrays, in the dtype of the belief's covariance."""
-    doors.belief("belief", belief, filter.model.space)
-    logs.validate(filter.model, log, belief.cov.dtype)
-    dtype = jax.dtypes.canonicalize_dtype(belief.cov.dtype)
-    belief, log = jax.tree.map(jnp.asarray, (belief, log))
-    belief = jax.tree.map(lambda a: a.astype(dtype), belief)
-    # Symmetric to the last bit, as each step leaves it: then half of it is enough for compiled lanes.
-    return belief._replace(cov=linalg.symmetrize(belief.cov)), log
+def _checked(filter: Filter, belief: Any, log: Log) -> tuple[Any, Log]:
+    """The belief and the log as arrays, the belief in one dtype."""
+    belief = filter.begin(belief)
+    logs.validate(filter.model, log, dtype_of(belief))
+    return belief, jax.tree.map(jnp.asarray, log)
 
 
 def scan_runs(
     filter: Filter,
-    belief: Gaussian,
+    belief: Any,
     log: Log,
     batched: Sequence[str] = Log._fields,
     store: Callable[[Any, dict[str, Info]], PyTree] = Track,
@@ -89,7 +86,8 @@ def scan_runs(
 
     Args:
         filter: from `kf`, `ekf`, `ukf`, ...
-        belief: shared by all runs, or with a leading run axis on every leaf.
+        belief: shared by all runs, or with a leading run axis on every leaf. What is drawn has one: ``jax.vmap(lambda
+            key: filter.begin(belief, key))(keys)``.
         log: the logs, with a leading run axis on the fields named in ``batched``.
         batched: fields of the log that differ by run; all by default, as `stack` returns them.
         store, segment: as in `scan`.
@@ -113,16 +111,16 @@ def scan_runs(
     unknown = [name for name in batched if name not in Log._fields]
     if unknown:
         raise ValueError(f"batched: expected fields of {Log._fields}, got {unknown}")
-    belief_axis = 0 if jnp.ndim(belief.cov) == 3 else None
+    belief_axis = 0 if _is_batch(filter, belief) else None
     axes: Any = Log._make(0 if name in batched else None for name in Log._fields)
     differ = [leaf for name in batched for leaf in jax.tree.leaves(getattr(log, name))]
     if belief_axis is None and not differ:
         raise ValueError(f"batched: expected a belief or fields of the log that differ by run, got {tuple(batched)}")
-    runs = len(belief.cov if belief_axis == 0 else differ[0])
+    runs = len(jax.tree.leaves(belief)[0] if belief_axis == 0 else differ[0])
     look = jax.vmap(lambda b, *fields: _checked(filter, b, Log(*fields)), (belief_axis, *axes), (belief_axis, axes))
     belief, log = look(belief, *log)
 
-    def body(_: PyTree, b: Gaussian, row: Log) -> tuple[Gaussian, tuple]:
+    def body(_: PyTree, b: PyTree, row: Log) -> tuple[PyTree, tuple]:
         b, info = filter.step(b, row)
         return b, (store(b, info),)
 
@@ -131,7 +129,16 @@ def scan_runs(
     return stored
 
 
-def log_likelihood(filter: Filter, belief: Gaussian, log: Log, segment: int | None = None) -> jax.Array:
+def _is_batch(filter: Filter, belief: Any) -> bool:
+    """Whether each run has its own: one more axis than what the filter would carry of one run."""
+    if isinstance(belief, Gaussian):
+        return jnp.ndim(belief.cov) == 3
+    origin = Gaussian(filter.model.space.origin, jnp.eye(filter.model.space.dim))
+    one = jax.eval_shape(lambda: filter.begin(origin, jax.random.key(0)))
+    return jnp.ndim(jax.tree.leaves(belief)[0]) > jnp.ndim(jax.tree.leaves(one)[0])
+
+
+def log_likelihood(filter: Filter, belief: Any, log: Log, segment: int | None = None) -> jax.Array:
     """log p(z_1 ... z_T): the sum of the log densities of the innovations, ``sum_k log N(r_k; 0, S_k)``.
 
     Exact for a `kf` on a linear model, also with missing components. A reading that a gate refused adds nothing.

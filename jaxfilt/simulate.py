@@ -101,5 +101,7 @@ def _moved(model: Model, x: PyTree, u: PyTree, dt: Array, key: Array) -> PyTree:
 
 def _reading(model: Model, name: str, x: PyTree, row: Log, key: Array) -> PyTree:
     sensor, c = model.sensors[name], row.c.get(name, ())
+    if sensor.law is not None:
+        return doors.call(f"law.draw(x, c, key) of sensor {name!r}", sensor.law.draw, x=x, c=c, key=key)
     image = doors.call(f"h(x, c) of sensor {name!r}", sensor.h, x=x, c=c)
     return _perturbed(image, sensor.R(x, c), sensor.space, key)

@@ -62,16 +62,44 @@ class Space(NamedTuple):
     flat: bool
 
 
+class Transition(NamedTuple):
+    """How the state before and the state after an interval hang together, as a Kalman filter's prediction sees it.
+
+    ``belief`` is that after the interval; ``cross`` (n, n) the covariance of the state before with the state after;
+    ``remainder(K)`` the (n, n) covariance of ``x - K x'``, process noise and all, computed as a product. Tangent spaces
+    are those at the mean before, and at the mean of ``belief``.
+    """
+
+    belief: Gaussian
+    cross: Array
+    remainder: Callable[[Array], Array]
+
+
+class Law(NamedTuple):
+    """How a sensor's readings are distributed where that is not normal: a door seen or not, an echo that misses.
+
+    ``log_density(z, x, c)`` is log p(z | x), up to a constant that no x changes if nobody compares likelihoods;
+    ``draw(x, c, key)`` a reading.
+    """
+
+    log_density: Callable[[PyTree, PyTree, PyTree], Array]
+    draw: Callable[[PyTree, PyTree, Array], PyTree]
+
+
 class Sensor(NamedTuple):
     """What a sensor reports: ``z = h(x, c) + v``, ``v ~ N(0, R(x, c))``, on ``space``.
 
     ``c`` is the context of one reading, ``()`` unless the log says otherwise: which landmark was seen, where
     the satellite was, a matrix H of that instant.
+
+    With a ``law`` readings are distributed as it says, and h and R are their mean and covariance: particle and grid
+    filters and simulations go by the law, Kalman filters know these two moments of it.
     """
 
     h: Callable[[PyTree, PyTree], PyTree]
     R: Callable[[PyTree, PyTree], Array]
     space: Space
+    law: Law | None = None
 
 
 class Model(NamedTuple):
@@ -168,18 +196,28 @@ class Filter(NamedTuple):
 
     ``predict(belief, u, dt) -> belief``; ``update(belief, z, sensor, c=(), mask=None) -> (belief, Info)``;
     ``step(belief, row) -> (belief, {sensor: Info})``, where a row is one row of a `Log`.
+
+    A Kalman filter carries a `Gaussian`; others carry what they need: particles, cells, a map with what was seen of it.
+    ``begin(belief, key=None)`` makes what is carried from a `Gaussian`, with a key of `jax.random` where it is drawn;
+    what is carried already it returns, checked, as arrays of one dtype. ``gaussian(carried)`` is its mean and
+    covariance, by which every filter is scored. ``transition(belief, u, dt)``, dt > 0, is the `Transition` that a
+    smoother goes back by; None where a filter has none.
     """
 
-    predict: Callable[..., Gaussian]
-    update: Callable[..., tuple[Gaussian, Info]]
-    step: Callable[[Gaussian, Log], tuple[Gaussian, dict[str, Info]]]
+    predict: Callable[..., Any]
+    update: Callable[..., tuple[Any, Info]]
+    step: Callable[[Any, Log], tuple[Any, dict[str, Info]]]
     model: Model
+    begin: Callable[..., Any]
+    gaussian: Callable[[Any], Gaussian]
+    transition: Callable[..., Transition] | None = None
 
 
 class Track(NamedTuple):
-    """What a scan returns: the belief after each row, and ``info``, a dict sensor -> Info; leading axis T."""
+    """What a scan returns: the belief after each row, or what else the filter carries, and ``info``, a dict sensor ->
+    Info; leading axis T."""
 
-    belief: Gaussian
+    belief: Any
     info: dict[str, Info]
 
 
