@@ -11,6 +11,7 @@ from jaxfilt.files import load, save
 from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
 from jaxfilt.fit import Fit
 from jaxfilt.fold import Objective, Seen
+from jaxfilt.grid import Cells, grid, lattice
 from jaxfilt.integrate import euler, rk4
 from jaxfilt.log import align, merge, schedule, stack, validate
 from jaxfilt.mismatch import scaled
@@ -30,11 +31,14 @@ from jaxfilt.noise import (
 )
 from jaxfilt.objectives import held_back, likelihood, log_score, mix, mse, nees_match, nis_match
 from jaxfilt.out_of_sequence import OutOfSequence, out_of_sequence
+from jaxfilt.particle import Kidnapping, Particles, particle
 from jaxfilt.report.arrays import to_xarray
 from jaxfilt.review import Replayed, Review, replayed
 from jaxfilt.run import log_likelihood, mean_and_std, mean_only, scan, scan_runs
 from jaxfilt.scores import Paired, Scores
 from jaxfilt.simulate import Simulation, sample, simulate
+from jaxfilt.slam import Chart, Swarm, ekf_slam, fast_slam
+from jaxfilt.smooth import Smoothed, fixed_lag, sample_trajectories, smooth
 from jaxfilt.spaces import angle, product, rotate, rotate_back, scalar, so2, so3, so3_exp, so3_log, vector
 from jaxfilt.study import Interrupted, Study, study
 from jaxfilt.sweep import Sweep, sweep
@@ -46,6 +50,7 @@ from jaxfilt.types import (
     Filter,
     Gaussian,
     Info,
+    Law,
     Log,
     Model,
     Moments,
@@ -57,12 +62,15 @@ from jaxfilt.types import (
     Status,
     Stream,
     Track,
+    Transition,
     Truth,
 )
 from jaxfilt.verdict import Verdict, innovation_verdict, verdicts
 
 __all__ = [
     "Bound",
+    "Cells",
+    "Chart",
     "Checkup",
     "Diagnosis",
     "Filter",
@@ -70,6 +78,8 @@ __all__ = [
     "Gaussian",
     "Info",
     "Interrupted",
+    "Kidnapping",
+    "Law",
     "Log",
     "Model",
     "Moments",
@@ -77,6 +87,7 @@ __all__ = [
     "OutOfSequence",
     "Paired",
     "Parametrisation",
+    "Particles",
     "Recording",
     "Replay",
     "Replayed",
@@ -86,13 +97,16 @@ __all__ = [
     "Seen",
     "Sensor",
     "Simulation",
+    "Smoothed",
     "Space",
     "Split",
     "Status",
     "Stream",
     "Study",
+    "Swarm",
     "Sweep",
     "Track",
+    "Transition",
     "Truth",
     "Verdict",
     "align",
@@ -113,13 +127,18 @@ __all__ = [
     "diagonal",
     "efficiency",
     "ekf",
+    "ekf_slam",
     "euler",
+    "fast_slam",
+    "fixed_lag",
     "floored",
     "gauss_hermite",
+    "grid",
     "held_back",
     "iekf",
     "innovation_verdict",
     "kf",
+    "lattice",
     "likelihood",
     "linear",
     "load",
@@ -136,6 +155,7 @@ __all__ = [
     "nis_match",
     "norm",
     "out_of_sequence",
+    "particle",
     "priors",
     "product",
     "range_bearing",
@@ -144,6 +164,7 @@ __all__ = [
     "rotate",
     "rotate_back",
     "sample",
+    "sample_trajectories",
     "save",
     "scalar",
     "scaled",
@@ -153,6 +174,7 @@ __all__ = [
     "shared",
     "simulate",
     "sinc",
+    "smooth",
     "so2",
     "so3",
     "so3_exp",

@@ -177,20 +177,35 @@ def _chunk(
         x, read = jax.lax.optimization_barrier(draw(key, x, row[0]))
         truth = plan.view(x)
         held, found = judged(bank, place, plan.blocks, list(sensors), weight, held, read, truth, row[1])
-        return (x, held), (found[:2], found[2:], Examples(truth, held[0]))
+        tracks = {name: filt.gaussian(held[0][name]) for name, filt in bank.items()}
+        return (x, held), (found[:2], found[2:], Examples(truth, tracks))
 
-    beliefs, told = dict.fromkeys(bank, start), nothing(place, len(bank), plan.lags, sensors, np.dtype(dtype))
+    beliefs, shared = _begun(bank, start, own)
+    told = nothing(place, len(bank), plan.lags, sensors, np.dtype(dtype))
     (_, (_, told)), (added, some, examples) = loop(
         body,
         (weights, keys),
         (x, (beliefs, told)),
         (rows, instants(log)),
         runs=len(numbers),
-        axes=(0, (0, None), (axes, None)),
+        axes=(0, (0, (shared, None)), (axes, None)),
         outputs=(Added(), Kept(every(len(log.dt))), Kept(runs=plan.examples)),
         backend=plan.backend,
     )
     return _summed(plan, place, space.dim, weights, told, Row(*added, *some), examples)
+
+
+def _begun(bank: dict[str, Filter], start: Gaussian, own: Array) -> tuple[dict[str, PyTree], dict[str, int | None]]:
+    """What each filter carries at the start, and its axis: runs share a Gaussian; anything else each draws for itself,
+    with its ``own`` key.
+    """
+    beliefs, axes = {}, {}
+    for i, (name, filt) in enumerate(bank.items()):
+        # Not fold_in(key, 0 ... 2): the simulation and what happens to its readings draw from those.
+        begun = jax.vmap(lambda key, filt=filt, i=i: filt.begin(start, jax.random.fold_in(key, 3 + i)))
+        drawn = not isinstance(jax.eval_shape(begun, own), Gaussian)
+        beliefs[name], axes[name] = (begun(own), 0) if drawn else (filt.begin(start), None)
+    return beliefs, axes
 
 
 def _key(plan: Plan, data: Array) -> Array:

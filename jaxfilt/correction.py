@@ -146,8 +146,8 @@ def moved(space: Space, belief: Gaussian, delta: jax.Array, P: jax.Array) -> Gau
 
 
 def carried(space: Space, belief: Gaussian, mean: PyTree) -> jax.Array:
-    """The belief's covariance, carried from the tangent space at its own mean to that at another."""
-    return _carried(space, belief.mean, space.minus(mean, belief.mean), mean, belief.cov)
+    """The belief's covariance, about its own mean all the same, in the tangent space at another point."""
+    return _carried(space, belief.mean, jnp.zeros(space.dim, belief.cov.dtype), mean, belief.cov)
 
 
 def _carried(space: Space, base: PyTree, delta: jax.Array, mean: PyTree, P: jax.Array) -> jax.Array:

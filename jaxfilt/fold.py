@@ -15,8 +15,9 @@ import numpy as np
 from jaxfilt import doors
 from jaxfilt import log as logs
 from jaxfilt.loop import checkpointed
+from jaxfilt.prediction import dtype_of
 from jaxfilt.transforms import taylor
-from jaxfilt.types import Array, Filter, Gaussian, Info, Log, PyTree, Space, Truth
+from jaxfilt.types import Array, Filter, Info, Log, PyTree, Space, Truth
 
 View = Callable[[PyTree], PyTree]
 
@@ -35,7 +36,7 @@ class Seen(NamedTuple):
     filter, and with nothing else."""
 
     filter: Filter
-    belief: Gaussian
+    belief: Any
     info: dict[str, Info]
     error: Array
     cov: Array
@@ -61,7 +62,7 @@ class Objective(NamedTuple):
     def __call__(
         self,
         filter: Filter,
-        belief: Gaussian,
+        belief: Any,
         log: Log,
         truth: Truth | None = None,
         *,
@@ -82,8 +83,8 @@ class Objective(NamedTuple):
             ValueError, TypeError, KeyError: naming the argument, what was expected and what came.
         """
         doors.instance("filter", filter, Filter)
-        doors.belief("belief", belief, filter.model.space)
-        logs.validate(filter.model, log, belief.cov.dtype)
+        belief = filter.begin(belief)
+        logs.validate(filter.model, log, dtype_of(belief))
         space = filter.model.space if space is None else space
         check_truth(self, truth, space, len(log.dt))
         for name in self.held:
@@ -141,7 +142,7 @@ def withheld(log: Log, held: Mapping[str, int]) -> tuple[Log, Log]:
 def fold(
     objective: Objective,
     filter: Filter,
-    belief: Gaussian,
+    belief: Any,
     log: Log,
     truth: Truth | None,
     weight: Array,
@@ -167,7 +168,7 @@ def fold(
 def by_row(
     objective: Objective,
     filter: Filter,
-    belief: Gaussian,
+    belief: Any,
     log: Log,
     truth: Truth | None,
     space: Space,
@@ -175,8 +176,8 @@ def by_row(
     segment: int | None = None,
 ) -> dict[str, jax.Array]:
     """What the objective takes of each row, leading axis T: the terms of `fold`."""
-    belief = jax.tree.map(lambda a: jnp.asarray(a, belief.cov.dtype), belief)
-    take = taken(objective, filter, space, view, belief.cov.dtype)
+    belief = filter.begin(belief)
+    take = taken(objective, filter, space, view, dtype_of(belief))
     return checkpointed(take, belief, rows_of(objective, log, truth), segment)[1]
 
 
@@ -189,14 +190,15 @@ def taken(objective: Objective, filter: Filter, space: Space, view: View, dtype:
     """(belief, one of `rows_of`) -> (belief, what the objective takes of the row)."""
     whole = filter.model.space
 
-    def compared(b: Gaussian, truth: Truth) -> tuple[jax.Array, jax.Array]:
+    def compared(b: PyTree, truth: Truth) -> tuple[jax.Array, jax.Array]:
         # The belief as the truth sees it; of the whole state there is nothing to differentiate.
-        x, P = b if view is itself else taylor(view, b, whole, space)[:2]
+        seen = filter.gaussian(b)
+        x, P = seen if view is itself else taylor(view, seen, whole, space)[:2]
         there = jnp.asarray(truth.mask)
         point = jax.tree.map(lambda a, own: jnp.where(there, jnp.asarray(a, dtype), own), truth.x, x)
         return space.minus(point, x), jnp.where(there, P, jnp.eye(space.dim, dtype=dtype))
 
-    def take(b: Gaussian, xs: tuple) -> tuple[Gaussian, dict[str, Array]]:
+    def take(b: PyTree, xs: tuple) -> tuple[PyTree, dict[str, Array]]:
         row, held_row, truth_row = xs
         b, info = filter.step(b, row)
         error, cov = (None, None) if truth_row is None else compared(b, truth_row)

@@ -151,6 +151,11 @@ def inverse(S: jax.Array, L: jax.Array) -> jax.Array:
     return solve(S, L, jnp.eye(len(L), dtype=L.dtype))
 
 
+def general_solve(A: jax.Array, b: jax.Array) -> jax.Array:
+    """A^-1 b for any regular A (n, n) and b (n,) or (n, k), by LU: a call of LAPACK for each matrix."""
+    return jnp.linalg.solve(A, b)
+
+
 @jax.custom_jvp
 def score(S: jax.Array, L: jax.Array, r: jax.Array) -> tuple[jax.Array, jax.Array]:
     """r' S^-1 r and log |S| for S = L L' (m, m) and r (m,): what makes a Gaussian's log density.

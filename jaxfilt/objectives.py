@@ -33,6 +33,7 @@ import numpy as np
 from jaxfilt import metrics
 from jaxfilt.fold import Objective, Seen
 from jaxfilt.metrics import Blocks
+from jaxfilt.prediction import dtype_of
 from jaxfilt.types import Array, Info
 
 Sums = dict[str, Array]
@@ -127,7 +128,7 @@ as every `Objective`: see the example of this module.
 
 
 def _nis_row(seen: Seen) -> Sums:
-    dtype = seen.belief.cov.dtype
+    dtype = dtype_of(seen.belief)
     readings = [_reading(seen.info.get(name), dtype) for name in seen.filter.model.sensors]
     nis, dof = (jnp.stack(column) for column in zip(*readings, strict=True))
     count = (dof > 0).sum()

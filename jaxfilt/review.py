@@ -18,7 +18,7 @@ from jaxfilt.run import scan
 from jaxfilt.scores import Fault
 from jaxfilt.task import Filters, checked, checked_blocks, strong
 from jaxfilt.transforms import taylor
-from jaxfilt.types import Gaussian, Info, Log, PyTree, Replay, Space, Status, Truth
+from jaxfilt.types import Array, Filter, Info, Log, PyTree, Replay, Space, Status, Truth
 from jaxfilt.verdict import Verdict, innovation_verdict
 
 
@@ -63,7 +63,13 @@ class Replayed(NamedTuple):
 
 
 def replayed(
-    replay: Replay, filters: Filters, *, theta: PyTree = None, lags: int = 20, confidence: float = CONFIDENCE
+    replay: Replay,
+    filters: Filters,
+    *,
+    theta: PyTree = None,
+    lags: int = 20,
+    confidence: float = CONFIDENCE,
+    key: Array | None = None,
 ) -> Replayed:
     """Run filters over a recording and score them: against the truth where it is known, by their innovations always.
 
@@ -73,6 +79,7 @@ def replayed(
         theta: parameters; default the replay's.
         lags: as in `jaxfilt.metrics.whiteness`.
         confidence: probability of all two-sided bounds.
+        key: of `jax.random`, for filters that draw: particles.
 
     Raises:
         ValueError, TypeError, KeyError: naming the argument, what was expected and what came.
@@ -95,7 +102,7 @@ def replayed(
     known = () if truth is None else jax.tree.map(lambda a: jnp.asarray(a, dtype), truth.x)
     arguments = strong(theta, dtype), log, known
     began = time.perf_counter()
-    program = jax.jit(functools.partial(_one, replay, dict(filters))).lower(*arguments).compile()
+    program = jax.jit(functools.partial(_one, replay, dict(filters), key)).lower(*arguments).compile()
     compiled = time.perf_counter()
     out = jax.device_get(program(*arguments))
     done = time.perf_counter()
@@ -114,18 +121,21 @@ def replayed(
     )
 
 
-def _one(replay: Replay, filters: Filters, theta: PyTree, log: Log, known: PyTree) -> dict[str, Any]:
+def _one(replay: Replay, filters: Filters, key: Array | None, theta: PyTree, log: Log, known: PyTree) -> dict[str, Any]:
     """Each filter's track as the truth sees it: (mean, std, info, sound, error, nees), the last two None without it."""
     start, whole, part = replay.belief(theta), replay.model(theta).space, replay.space
 
-    def store(b: Gaussian, info: dict[str, Info]) -> tuple:
+    def store(filter: Filter, carried: PyTree, info: dict[str, Info]) -> tuple:
+        b = filter.gaussian(carried)
         x, P = taylor(replay.view, b, whole, part)[:2]
         spread = jnp.diagonal(P) if replay.truth is None else P
         return x, spread, info, jnp.all(jnp.isfinite(b.cov)) & jnp.all(jnp.isfinite(spread))
 
     out = {}
     for name, make in filters.items():
-        x, spread, info, sound = scan(make(theta), start, log, store)
+        filter = make(theta)
+        begun = filter.begin(start, key)
+        x, spread, info, sound = scan(filter, begun, log, functools.partial(store, filter))
         if replay.truth is None:
             out[name] = x, jnp.sqrt(spread), info, sound, None, None
         else:

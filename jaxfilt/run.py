@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxfilt import doors
 from jaxfilt import log as logs
 from jaxfilt.loop import Backend, Kept, checkpointed, loop
+from jaxfilt.parallel import filtered
 from jaxfilt.prediction import dtype_of
 from jaxfilt.types import Array, Filter, Gaussian, Info, Log, PyTree, Track
 
@@ -21,6 +22,7 @@ def scan(
     log: Log,
     store: Callable[[Any, dict[str, Info]], PyTree] = Track,
     segment: int | None = None,
+    parallel: bool = False,
 ) -> Any:
     """Run a filter over a log: ``belief_k = step(belief_{k-1}, row_k)``, under `jax.lax.scan`.
 
@@ -34,12 +36,16 @@ def scan(
             `mean_only` are ready-made.
         segment: rows between the beliefs that reverse mode keeps, see `checkpointed`: with the square root of T, memory
             for 2 sqrt(T) beliefs, not for T, and one more forward pass. The result does not depend on it.
+        parallel: all segments (by default about sqrt(T) of as many rows) at once, what they start with from an
+            associative scan; the same to rounding. For a `kf` or `ekf` without gate and robust, of a model
+            that is linear in x, its readings' noise positive definite.
 
     Returns:
         What ``store`` returned, leading axis T; by default `Track` (belief, info).
 
     Raises:
-        ValueError, TypeError, KeyError: at the door, where the belief or the log do not fit the model.
+        ValueError, TypeError, KeyError: at the door, where the belief or the log do not fit the model; with
+            ``parallel`` also another filter or model than those.
 
     Example:
         >>> import jax.numpy as jnp, jaxfilt as jf
@@ -48,9 +54,14 @@ def scan(
         >>> track = jf.scan(jf.kf(walk), jf.Gaussian(jnp.zeros(1), jnp.eye(1)), log)
         >>> track.belief.mean.shape, track.info["z"].nis.shape
         ((3, 1), (3,))
+
+    Source of the parallel form: S. Sarkka, A. F. Garcia-Fernandez, Temporal parallelization of Bayesian smoothers, IEEE
+    Trans. Automatic Control 66(1) (2021).
     """
     doors.instance("filter", filter, Filter)
     belief, log = _checked(filter, belief, log)
+    if parallel:
+        return filtered(filter, belief, log, store, segment)
 
     def body(b: PyTree, row: Log) -> tuple[PyTree, PyTree]:
         b, info = filter.step(b, row)
@@ -138,20 +149,22 @@ def _is_batch(filter: Filter, belief: Any) -> bool:
     return jnp.ndim(jax.tree.leaves(belief)[0]) > jnp.ndim(jax.tree.leaves(one)[0])
 
 
-def log_likelihood(filter: Filter, belief: Any, log: Log, segment: int | None = None) -> jax.Array:
+def log_likelihood(
+    filter: Filter, belief: Any, log: Log, segment: int | None = None, parallel: bool = False
+) -> jax.Array:
     """log p(z_1 ... z_T): the sum of the log densities of the innovations, ``sum_k log N(r_k; 0, S_k)``.
 
     Exact for a `kf` on a linear model, also with missing components. A reading that a gate refused adds nothing.
 
     Args:
-        filter, belief, log, segment: as in `scan`.
+        filter, belief, log, segment, parallel: as in `scan`.
 
     Returns:
         A scalar, differentiable in everything.
 
     Source: S. Sarkka, Bayesian Filtering and Smoothing (2013), eq. 12.38.
     """
-    return scan(filter, belief, log, lambda b, info: sum(i.loglik for i in info.values()), segment).sum()
+    return scan(filter, belief, log, lambda b, info: sum(i.loglik for i in info.values()), segment, parallel).sum()
 
 
 def mean_only(belief: Gaussian, info: dict[str, Info]) -> PyTree:

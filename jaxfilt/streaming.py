@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfilt import metrics
 from jaxfilt.tally import Blocks, Columns, Moments, score
-from jaxfilt.types import Array, Filter, Gaussian, Log, PyTree, Status
+from jaxfilt.types import Array, Filter, Log, PyTree, Status
 
 NO_FAULT = np.int32(2**31 - 1)
 """A fault that is none, later than all others."""
@@ -98,18 +98,22 @@ def judged(
     blocks: Blocks,
     sensors: Sequence[str],
     weight: Array,
-    carry: tuple[dict[str, Gaussian], Told],
+    carry: tuple[dict[str, PyTree], Told],
     row: Log,
     truth: PyTree,
     at: At,
-) -> tuple[tuple[dict[str, Gaussian], Told], Row]:
-    """The beliefs and what is told after a row, of which ``truth`` is the true state; ``weight`` (F,): what counts."""
+) -> tuple[tuple[dict[str, PyTree], Told], Row]:
+    """What the filters carry and what is told after a row.
+
+    ``truth`` is the true state, ``weight`` (F,) says which filters count.
+    """
     beliefs, told = carry
     space = next(iter(bank.values())).model.space
     stepped = {name: filt.step(beliefs[name], row) for name, filt in bank.items()}
     beliefs = {name: b for name, (b, _) in stepped.items()}
-    error = jnp.stack([metrics.errors(space, truth, b.mean) for b in beliefs.values()])
-    cov = jnp.stack([b.cov for b in beliefs.values()])
+    gaussians = [bank[name].gaussian(b) for name, b in beliefs.items()]
+    error = jnp.stack([metrics.errors(space, truth, b.mean) for b in gaussians])
+    cov = jnp.stack([b.cov for b in gaussians])
     infos = [{name: info[name] for name in sensors} for _, info in stepped.values()]
     info = jax.tree.map(lambda *a: jnp.stack(a), *infos)
     # One call for all filters: each factorization written out costs time to compile.

@@ -108,7 +108,10 @@ def task_of(
         blocks = checked_blocks(o.blocks, space.dim)
     devices = tuple(jax.devices() if o.devices is None else o.devices)
     workers = _workers(devices) if o.workers is None else o.workers
-    chunk = _chunk(space, filters, log, o, dtype, workers, len(devices), len(settings)) if o.chunk is None else o.chunk
+    carried = _carried(filters, belief, theta)
+    chunk = o.chunk
+    if chunk is None:
+        chunk = _chunk(space, filters, log, o, dtype, workers, len(devices), len(settings), carried)
     given = o._asdict() | {"workers": workers, "chunk": chunk}
     for name, least in {"runs": 1, "workers": 1, "chunk": 1, "examples": 0, "sample": 0, "lags": 1}.items():
         if given[name] < least:
@@ -219,8 +222,25 @@ def _workers(devices: tuple) -> int:
     return 2 if len(devices) == 1 and devices[0].platform == "cpu" and (os.cpu_count() or 1) > 1 else 1
 
 
+def _carried(filters: Filters, belief: Callable[[PyTree], Gaussian], theta: PyTree) -> int:
+    """Bytes that the filters of one run carry from row to row."""
+
+    def begun() -> list[PyTree]:
+        return [make(theta).begin(belief(theta), jax.random.key(0)) for make in filters.values()]
+
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(jax.eval_shape(begun)))
+
+
 def _chunk(
-    space: Space, filters: Filters, log: Log, o: Options, dtype: np.dtype, workers: int, devices: int, settings: int
+    space: Space,
+    filters: Filters,
+    log: Log,
+    o: Options,
+    dtype: np.dtype,
+    workers: int,
+    devices: int,
+    settings: int,
+    carried: int,
 ) -> int:
     """Runs in a chunk: as many as memory allows, and evenly shared between the workers; that of a resumed study."""
     if o.resume and o.out is not None:
@@ -234,7 +254,7 @@ def _chunk(
     row = dtype.itemsize * (0 if o.corrupt is None else simulated + 2 * numbers(log.z))
     # Of some rows, by filter: error, normalised error, NEES.
     some = dtype.itemsize * settings * len(filters) * (2 * space.dim + 1)
-    size = row * steps + some * (steps // every(steps))
+    size = row * steps + some * (steps // every(steps)) + carried * settings
     most = devices * max(1, min(MOST, int(MEMORY / size)))
     chunks = -(-o.runs // most)
     chunks = workers * -(-chunks // workers)

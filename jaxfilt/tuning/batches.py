@@ -11,7 +11,7 @@ import numpy as np
 from jaxfilt.loop import checkpointed
 from jaxfilt.tuning.loss import Evaluated, Problem, compiled, losses, started
 from jaxfilt.tuning.split import Case, apart, pieces, some
-from jaxfilt.types import Array, Gaussian, Log
+from jaxfilt.types import Array, Log, PyTree
 
 
 class Batches:
@@ -67,17 +67,17 @@ class _Begins:
         runs, rows = case.weight.shape
         count = -(-rows // length)
 
-        def one(v: Array, case: Case) -> Gaussian:
+        def one(v: Array, case: Case) -> PyTree:
             theta = problem.parameters.tree(v)
-            filter, start = problem.filter(theta), started(problem, theta, case)
+            filter = problem.filter(theta)
 
-            def step(b: Gaussian, row: Log) -> tuple[Gaussian, Gaussian]:
+            def step(b: PyTree, row: Log) -> tuple[PyTree, PyTree]:
                 return filter.step(b, row)[0], b
 
-            before = checkpointed(step, start, case.log)[1]
+            before = checkpointed(step, filter.begin(started(problem, theta, case)), case.log)[1]
             return jax.tree.map(lambda a: a[::length], before)
 
-        def every(V: Array, data: Case) -> Gaussian:
+        def every(V: Array, data: Case) -> PyTree:
             of_runs = jax.vmap(jax.vmap(one, in_axes=(None, axes)), in_axes=(0, None))(V, data)
             return jax.tree.map(lambda a: a.reshape(starts, runs * count, *a.shape[3:]), of_runs)
 

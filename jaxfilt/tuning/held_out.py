@@ -47,7 +47,8 @@ def scorer(problem: Problem, case: Case, theta: PyTree) -> Callable[[PyTree], Ro
         used = {name: metrics.used(info) for name, info in seen.info.items()}
         found = {f"nis {name}": nis for name, (nis, _) in used.items()}
         found |= {f"dof {name}": dof for name, (_, dof) in used.items()}
-        found |= {f"mean {i}": leaf for i, leaf in enumerate(jax.tree.leaves(seen.belief.mean))}
+        mean = seen.filter.gaussian(seen.belief).mean
+        found |= {f"mean {i}": leaf for i, leaf in enumerate(jax.tree.leaves(mean))}
         if truth:
             found |= {
                 "error": jnp.where(seen.known, seen.error, jnp.nan),

@@ -56,7 +56,7 @@ def losses(
     """
 
     def every(lanes: bool) -> Callable:
-        def evaluated(v: Array, data: Case, begin: Gaussian | None) -> Evaluated:
+        def evaluated(v: Array, data: Case, begin: PyTree) -> Evaluated:
             return _evaluated(problem, v, data, begin, axes, gradient, lanes)
 
         return lambda V, data, begin: jax.vmap(evaluated, in_axes=(0, None, 0))(V, data, begin)
@@ -79,16 +79,17 @@ def started(problem: Problem, theta: PyTree, case: Case) -> Gaussian:
     return jax.tree.map(lambda *a: jnp.stack(a)[case.run], *each) if len(each) > 1 else each[0]
 
 
-def _begun(problem: Problem, v: Array, case: Case, begin: Gaussian | None) -> Gaussian:
-    """The belief in which one run starts, or a piece of one goes on."""
-    start = started(problem, problem.parameters.tree(v), case)
+def _begun(problem: Problem, v: Array, case: Case, begin: PyTree) -> PyTree:
+    """What the filter carries where one run starts, or a piece of one goes on."""
+    theta = problem.parameters.tree(v)
+    start = problem.filter(theta).begin(started(problem, theta, case))
     if begin is None or case.first is None:
         return start
     first = jnp.asarray(case.first)
     return jax.tree.map(lambda a, b: jnp.where(first, a, b), start, begin)
 
 
-def _sums(problem: Problem, v: Array, case: Case, begin: Gaussian | None) -> dict[str, jax.Array]:
+def _sums(problem: Problem, v: Array, case: Case, begin: PyTree) -> dict[str, jax.Array]:
     """Those of one run, or of a piece of one."""
     start, filter = _begun(problem, v, case, begin), problem.filter(problem.parameters.tree(v))
     truth, weight = case.truth, case.weight
@@ -101,7 +102,7 @@ def _every(problem: Problem, data: Case, axes: Case, lanes: bool) -> Callable:
         return over_runs(lambda v, begin, case: _sums(problem, v, case, begin), data, axes)
     objective, dtype = problem.objective, data.log.dt.dtype
 
-    def take(v: Array, belief: Gaussian, row: tuple) -> tuple[Gaussian, dict[str, Array]]:
+    def take(v: Array, belief: PyTree, row: tuple) -> tuple[PyTree, dict[str, Array]]:
         filter = problem.filter(problem.parameters.tree(v))
         return taken(objective, filter, problem.space, problem.view, dtype)(belief, row)
 
@@ -110,7 +111,7 @@ def _every(problem: Problem, data: Case, axes: Case, lanes: bool) -> Callable:
         belief, found = take(v, belief, seen)
         return (belief, {name: sums[name] + jnp.where(counts, a, 0.0) for name, a in found.items()}), ()
 
-    def every(V: Array, begin: Gaussian | None) -> dict[str, jax.Array]:
+    def every(V: Array, begin: PyTree) -> dict[str, jax.Array]:
         beliefs = jax.vmap(lambda v, begin, case: _begun(problem, v, case, begin), (0, 0, axes))(V, begin, data)
         if objective.held:
             split = jax.vmap(lambda case: (rows_of(objective, case.log, case.truth), case.weight), (axes,))
@@ -128,7 +129,7 @@ def _every(problem: Problem, data: Case, axes: Case, lanes: bool) -> Callable:
 
 
 def _evaluated(
-    problem: Problem, v: Array, data: Case, begin: Gaussian | None, axes: Case, gradient: bool, lanes: bool
+    problem: Problem, v: Array, data: Case, begin: PyTree, axes: Case, gradient: bool, lanes: bool
 ) -> Evaluated:
     runs = len(data.run)
     # Each run has parameters of its own, all alike: so its share of the gradient comes out apart, and that of a run
