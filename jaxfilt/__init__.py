@@ -1,6 +1,7 @@
 """jaxfilt: differentiable, batched Kalman filters in JAX."""
 
 from jaxfilt import priors
+from jaxfilt.averages import averaging, moving_average
 from jaxfilt.bootstrap import block_bootstrap
 from jaxfilt.bound import Bound, cramer_rao, efficiency
 from jaxfilt.check import Checkup, check
@@ -12,6 +13,7 @@ from jaxfilt.filters import build, ckf, ekf, iekf, kf, ukf
 from jaxfilt.fit import Fit
 from jaxfilt.fold import Objective, Seen
 from jaxfilt.grid import Cells, grid, lattice
+from jaxfilt.imm import Modes, imm
 from jaxfilt.integrate import euler, rk4
 from jaxfilt.log import align, merge, schedule, stack, validate
 from jaxfilt.mismatch import scaled
@@ -82,6 +84,7 @@ __all__ = [
     "Law",
     "Log",
     "Model",
+    "Modes",
     "Moments",
     "Objective",
     "OutOfSequence",
@@ -111,6 +114,7 @@ __all__ = [
     "Verdict",
     "align",
     "angle",
+    "averaging",
     "bearing",
     "block_bootstrap",
     "blocks",
@@ -136,6 +140,7 @@ __all__ = [
     "grid",
     "held_back",
     "iekf",
+    "imm",
     "innovation_verdict",
     "kf",
     "lattice",
@@ -150,6 +155,7 @@ __all__ = [
     "mean_only",
     "merge",
     "mix",
+    "moving_average",
     "mse",
     "nees_match",
     "nis_match",
