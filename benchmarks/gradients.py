@@ -85,7 +85,7 @@ def ours(name: str, filter: str, plan: jf.Log, segment: int | None) -> Loss:
     """Minus the log-likelihood of one run by the library."""
     robot = scenario(name)
     # An older library, to compare with, knows no segments.
-    options = {} if segment is None else {"segment": segment}
+    options: dict[str, Any] = {} if segment is None else {"segment": segment}
 
     def loss(theta: Any, log: jf.Log) -> jax.Array:
         whole = plan._replace(u=log.u, z=log.z)

@@ -123,7 +123,7 @@ def grid(model: Model, points: PyTree, moves: Moves | None = None) -> Filter:
 
         def on(cells: Cells) -> Cells:
             T = _log_moves(model, places(dtype), u, dt) if moves is None else _given(moves, u, dt, count, dtype)
-            return Cells(normalised(jax.nn.logsumexp(T + cells.log_probability, axis=1))[0])
+            return Cells(normalised(jax.nn.logsumexp(T + cells.log_probability[None, :], axis=1))[0])
 
         return branch(passes, on, lambda cells: cells, cells)
 
