@@ -165,6 +165,11 @@ def fast(model: Model) -> Filter:
     return fast_slam(model, 100)
 
 
+def of_two_minds(model: jf.Model) -> jf.Filter:
+    """Calm, or a hundred times as restless."""
+    return jf.imm([jf.ekf(model), jf.ekf(jf.scaled(model, Q=100.0))], jnp.array([[0.98, 0.02], [0.1, 0.9]]))
+
+
 ROWS: dict[str, tuple[str, Callable[[Work], Run]]] = {
     "KF (the EKF)": ("linear, 4 states", scanned(jf.kf)),
     "KF, parallel in time": ("linear, 4 states", scanned(jf.kf, parallel=True)),
@@ -176,6 +181,7 @@ ROWS: dict[str, tuple[str, Callable[[Work], Run]]] = {
     "CKF": ("car, 4 states", scanned(jf.ckf)),
     "Gauss-Hermite, 81 points": ("car, 4 states", scanned(lambda model: jf.build(jf.gauss_hermite(3), model))),
     "dead reckoning": ("car, 4 states", scanned(jf.dead_reckoning)),
+    "IMM of two EKFs": ("car, 4 states", scanned(of_two_minds)),
     "EKF and smoother": ("car, 4 states", smoothed(jf.ekf)),
     "UKF and smoother": ("car, 4 states", smoothed(jf.ukf)),
     "EKF, fixed lag of 10 rows": ("car, 4 states", scanned(lambda model: fixed_lag(jf.ekf(model), 10))),
